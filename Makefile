@@ -1,0 +1,45 @@
+# What one does with this project. `make` alone lists the targets.
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+
+.DEFAULT_GOAL := help
+.PHONY: help setup system-libraries demo test lint format parts bench clean
+
+help:  ## this menu
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-18s %s\n", $$1, $$2}'
+
+setup: $(VENV)/.installed  ## make .venv with the synthetless command in it
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[blender,dev]'
+	@touch $@
+
+system-libraries:  ## install the shared libraries Blender needs (Debian and Ubuntu, as root)
+	apt-get update -qq
+	apt-get install -y --no-install-recommends libx11-6 libxrender1 libxxf86vm1 libxfixes3 libxi6 libxkbcommon0 libsm6 libice6 libgl1 libegl1 libgomp1
+
+demo: setup  ## a small dataset of the built-in parts, in out/demo
+	$(BIN)/synthetless generate configs/demo.yaml --out out/demo
+
+test: setup  ## every test, real renders included
+	$(BIN)/pytest
+
+lint: setup  ## ruff and mypy --strict
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: setup  ## let ruff rewrite what it can
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+parts: setup  ## model the built-in parts again (assets/parts)
+	$(BIN)/python -m assets.parts.build
+
+bench: setup  ## measure (see benchmarks/)
+	@set -e; for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script; done
+
+clean:  ## remove generated datasets and caches
+	rm -rf out .pytest_cache .mypy_cache .ruff_cache .hypothesis
