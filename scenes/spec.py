@@ -1,5 +1,137 @@
 """What a scene consists of, as pure data: sampled once, recorded with every image, replayable.
 
-Frame: Blender's world, metres. The table is the plane z = 0, z up. Rotations are unit quaternions (w, x, y, z)
-that take the object's model frame to the world.
+World frame: metres, right-handed, the table is the plane z = 0 and z points up. Rotations are unit quaternions
+(w, x, y, z) that take model coordinates to world coordinates. Azimuth is measured about +z from +x.
 """
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from scenes.textures import PhotoTexture, ProceduralTexture
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Role = Literal["model", "distractor"]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A rigid pose, model to world.
+
+    Attributes:
+        rotation_wxyz: unit quaternion.
+        position_m: where the model's origin is, metres.
+    """
+
+    rotation_wxyz: Quaternion
+    position_m: Vector
+
+
+@dataclass(frozen=True)
+class Material:
+    """A dielectric's look: linear albedo (grey or RGB), roughness and specular level, each in 0..1."""
+
+    albedo: Vector
+    roughness: float
+    specular: float
+
+
+@dataclass(frozen=True)
+class ObjectSpec:
+    """One object of a drop: which model, what it is made of, and the pose it is released in.
+
+    A distractor comes from another models folder; it is rendered and occludes, but gets no label.
+    """
+
+    role: Role
+    obj_id: int
+    material: Material
+    release: Pose
+
+
+@dataclass(frozen=True)
+class PlaneSpec:
+    """The table: its texture, the side of one texture tile in metres, and how the tiling lies on the table."""
+
+    texture: ProceduralTexture | PhotoTexture
+    tile_m: float
+    rotation_deg: float
+    shift: tuple[float, float]
+    roughness: float
+    specular: float
+
+
+@dataclass(frozen=True)
+class PointLight:
+    """A lamp, seen from the point the camera aims at.
+
+    Attributes:
+        azimuth_deg, elevation_deg, distance_m: where it is.
+        strength: linear brightness of a white matte surface at the aim point that faces the lamp.
+        radius_m: of the glowing sphere; softens the shadows.
+        color: linear RGB, largest component 1.
+    """
+
+    azimuth_deg: float
+    elevation_deg: float
+    distance_m: float
+    strength: float
+    radius_m: float
+    color: Vector
+
+
+@dataclass(frozen=True)
+class AmbientLight:
+    """Light from everywhere: ``level`` is the linear brightness of a white matte surface under it alone."""
+
+    level: float
+    color: Vector
+
+
+@dataclass(frozen=True)
+class View:
+    """Where a camera stands, seen from the point it aims at: the centre of the settled objects plus an offset.
+
+    ``elevation_deg`` is the angle between the viewing ray and the table, so the table's tilt to the view is
+    90 - elevation. ``roll_deg`` turns the camera about its optical axis.
+    """
+
+    distance_m: float
+    elevation_deg: float
+    azimuth_deg: float
+    roll_deg: float
+    aim_offset_m: Vector
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """One drop: everything that is decided before physics and rendering begin.
+
+    ``attempt`` counts the throws that did not come to rest before this one; only the release poses differ
+    between attempts.
+    """
+
+    drop: int
+    attempt: int
+    objects: tuple[ObjectSpec, ...]
+    plane: PlaneSpec
+    light: PointLight
+    ambient: AmbientLight
+    views: tuple[View, ...]
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera without skew: image size, focal lengths and principal point, all in pixels.
+
+    The centre of the pixel in column i and row j is (u, v) = (i, j), as in OpenCV and BOP.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float

@@ -1,0 +1,35 @@
+"""Where the tests find real input: the T-LESS models and photographs, by environment variable or beside the project."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def _external(variable: str, fallback: Path) -> Path:
+    folder = Path(os.environ.get(variable, fallback))
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is not here; set {variable} to run this test")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def tless_models() -> Path:
+    """The 30 T-LESS CAD models with models_info.json."""
+    return _external("SYNTHETLESS_TLESS_MODELS", ROOT.parent / "shared" / "tless" / "models_cad")
+
+
+@pytest.fixture(scope="session")
+def photo_textures() -> Path:
+    """A folder of photographs for the table."""
+    return _external("SYNTHETLESS_TEXTURES", ROOT.parent / "shared" / "textures")
+
+
+@pytest.fixture(scope="session")
+def builtin_models() -> Path:
+    """The parts that come with the project."""
+    return ROOT / "assets" / "parts"
