@@ -109,9 +109,7 @@ def _find_meshes(folder: Path) -> dict[int, Path]:
     if not folder.is_dir():
         raise ModelError(f"{folder}: no such models folder; give one that holds obj_000001.ply, ...")
     files = {
-        int(match.group(1)): path
-        for path in sorted(folder.iterdir())
-        if (match := _PLY_NAME.fullmatch(path.name))
+        int(match.group(1)): path for path in sorted(folder.iterdir()) if (match := _PLY_NAME.fullmatch(path.name))
     }
     if not files:
         raise ModelError(f"{folder}: holds no models; expected files named obj_000001.ply, ...")
@@ -142,9 +140,7 @@ def _read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
         bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
         raise ModelError(f"{path}: vertex {bad} is {vertices[bad].tolist()}; every coordinate must be finite")
     if np.min(faces) < 0 or np.max(faces) >= len(vertices):
-        raise ModelError(
-            f"{path}: a face names vertex {int(np.max(faces))}, but there are only {len(vertices)}"
-        )
+        raise ModelError(f"{path}: a face names vertex {int(np.max(faces))}, but there are only {len(vertices)}")
     return vertices, np.ascontiguousarray(faces, dtype=np.int32)
 
 
@@ -153,10 +149,7 @@ def _check_box(path: Path, vertices_mm: NDArray[np.float64], info: Mapping[str, 
     size = np.ptp(vertices_mm, axis=0)
     for axis, measured in zip("xyz", size, strict=True):
         stated = info.get(f"size_{axis}")
-        if (
-            stated is not None
-            and abs(float(stated) - measured) > _REPORTED_BOX_TOLERANCE_MM + 0.01 * measured
-        ):
+        if stated is not None and abs(float(stated) - measured) > _REPORTED_BOX_TOLERANCE_MM + 0.01 * measured:
             raise ModelError(
                 f"{path}: is {measured:.3f} mm along {axis}, but {INFO_FILE} says {float(stated):.3f}; "
                 "are its units millimetres, and is it the right mesh?"
