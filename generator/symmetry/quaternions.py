@@ -1,0 +1,135 @@
+"""Unit quaternions (w, x, y, z), Hamilton product, as NumPy arrays with the four numbers in the last axis.
+
+q and -q are the same rotation. `multiply(p, q)` is the rotation "first q, then p", as with matrices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+IDENTITY: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+MAX_DEFECT = 1e-2  # Frobenius distance of a matrix from the nearest rotation that still counts as rounding
+
+
+def multiply(p: Floats, q: Floats) -> Floats:
+    """The product p q of (broadcastable) quaternion arrays (..., 4)."""
+    pw, px, py, pz = (p[..., i] for i in range(4))
+    qw, qx, qy, qz = (q[..., i] for i in range(4))
+    return np.stack(
+        [
+            pw * qw - px * qx - py * qy - pz * qz,
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+        ],
+        axis=-1,
+    )
+
+
+def conjugate(q: Floats) -> Floats:
+    """The inverse rotations, (..., 4)."""
+    return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))
+
+
+def normalise(q: ArrayLike) -> Floats:
+    """Vectors of any dimension scaled to length 1 along the last axis."""
+    values = np.asarray(q, dtype=np.float64)
+    return np.asarray(values / np.linalg.norm(values, axis=-1, keepdims=True))
+
+
+def from_axis_angle(axis: ArrayLike, angle_rad: ArrayLike) -> Floats:
+    """Rotations by angles (...) about unit axes (..., 3), as (..., 4)."""
+    half = np.asarray(angle_rad, dtype=np.float64)[..., None] / 2
+    vector = np.sin(half) * np.asarray(axis, dtype=np.float64)
+    return np.concatenate([np.broadcast_to(np.cos(half), (*vector.shape[:-1], 1)), vector], axis=-1)
+
+
+def minimal(u: Floats, v: Floats) -> Floats:
+    """The smallest rotations (..., 4) taking unit vectors u to unit vectors v, both (..., 3) and not opposite."""
+    u, v = np.broadcast_arrays(u, v)
+    return normalise(np.concatenate([1 + np.sum(u * v, axis=-1, keepdims=True), np.cross(u, v)], axis=-1))
+
+
+def rotate(q: Floats, v: Floats) -> Floats:
+    """The vectors v (..., 3) turned by q (..., 4)."""
+    w, xyz = q[..., :1], q[..., 1:]
+    twice = 2 * np.cross(xyz, v)
+    return v + w * twice + np.cross(xyz, twice)
+
+
+def angle_deg(p: Floats, q: Floats) -> Floats:
+    """Geodesic rotation angle between p and q in degrees, 0 to 180, accurate for tiny angles as well."""
+    far, near = np.linalg.norm(p - q, axis=-1), np.linalg.norm(p + q, axis=-1)
+    return np.asarray(np.degrees(4 * np.arctan2(np.minimum(far, near), np.maximum(far, near))))
+
+
+def to_matrix(q: Floats) -> Floats:
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
+    products = q[..., :, None] * q[..., None, :]
+    flat = products.reshape(*q.shape[:-1], 16) @ _MATRIX_OF_PRODUCTS
+    return np.asarray(flat.reshape(*q.shape[:-1], 3, 3))
+
+
+def from_matrix(R: ArrayLike, name: Callable[[int], str] = "rotation {}".format) -> Floats:
+    """Unit quaternions (N, 4) of rotation matrices (N, 3, 3).
+
+    A matrix that is slightly off (rounding in a file) is replaced by its nearest rotation. With P = (K + 1) / 4, K the
+    symmetric 4x4 matrix of Bar-Itzhack ("New method for extracting the quaternion from a rotation matrix", 2000), an
+    exact rotation has P = q q^T, and the nearest rotation's q is P's dominant eigenvector: two power steps from the
+    best axis find it to second order in the error.
+
+    Raises:
+        ValueError: a matrix with NaN, a reflection, or one farther than `MAX_DEFECT` from any rotation; `name` says
+            how to call number i.
+    """
+    matrices = np.asarray(R, dtype=np.float64)
+    flat = matrices.reshape(-1, 9)
+    P = (flat @ _PROJECTOR_OF_MATRIX + _PROJECTOR_CONSTANT).reshape(-1, 4, 4)
+    best = np.argmax(P[:, range(4), range(4)], axis=1)
+    start = P[np.arange(len(P)), best]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        start /= np.sqrt(np.einsum("ni,ni->n", start, start))[:, None]
+        q = np.einsum("nij,nj->ni", P, start)
+        eigenvalue = np.sqrt(np.einsum("ni,ni->n", q, q))
+        q /= eigenvalue[:, None]
+    # |R - R(q)|^2 = |R|^2 + 3 - 2 trace(R^T R(q)), and the trace is 4 q^T P q - 1.
+    defect = np.einsum("ni,ni->n", flat, flat) + 5 - 8 * eigenvalue
+    bad = ~(defect <= MAX_DEFECT**2)
+    if bad.any():
+        i = int(np.argmax(bad))
+        raise ValueError(f"{name(i)} is no rotation: {_what_is_wrong(flat[i].reshape(3, 3))}")
+    return np.asarray(q)
+
+
+def _what_is_wrong(matrix: Floats) -> str:
+    shown = np.array2string(matrix.ravel(), precision=4, max_line_width=1000, separator=", ")
+    if not np.isfinite(matrix).all():
+        return f"{shown} has a number that is not finite"
+    if abs(np.linalg.det(matrix) + 1) < 0.1:
+        return f"{shown} is a reflection (determinant -1), which no rigid motion can show"
+    return f"{shown} is not orthonormal with determinant 1"
+
+
+def _linear_maps() -> tuple[Floats, Floats]:
+    """The linear maps products q_i q_j (16) -> matrix (9), and matrix (9) -> 4 P - 1 (16)."""
+    to_nine = np.zeros((16, 9))
+    to_sixteen = np.zeros((9, 16))
+    basis = np.eye(4)
+    for i in range(4):
+        for j in range(4):
+            # R(q) v = q v conj(q); its bilinear form on basis quaternions, one column v of the matrix at a time.
+            columns = [multiply(multiply(basis[i], basis[k]), conjugate(basis[j]))[1:] for k in (1, 2, 3)]
+            to_nine[4 * i + j] = np.stack(columns, axis=1).ravel()
+    symmetric = (to_nine.reshape(4, 4, 9) + to_nine.reshape(4, 4, 9).transpose(1, 0, 2)) / 2
+    to_sixteen[:] = symmetric.reshape(16, 9).T  # trace(R^T R(x)) = x^T K x, whose coefficients these are
+    return to_nine, to_sixteen
+
+
+_MATRIX_OF_PRODUCTS, _K_OF_MATRIX = _linear_maps()
+_PROJECTOR_OF_MATRIX: Floats = _K_OF_MATRIX / 4
+_PROJECTOR_CONSTANT: Floats = np.eye(4).ravel() / 4

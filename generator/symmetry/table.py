@@ -1,0 +1,289 @@
+"""The symmetry table: which group each object of a dataset has, as a file that a person or a program writes.
+
+By hand (YAML or JSON):
+
+    object 26: {group: C2, axis: [0, 0, 1], offset: [-7, 0, 0]}
+    object 27: {group: C4}
+    object 31: {group: D3, axis: [0, 0, 1], secondary_axis: [1, 0, 0]}
+
+As `symmetries.json` beside a dataset: {"scheme", "allocentric", "objects": {id: entry}}, where an entry also says what
+follows from the group: order, n_regressors, anchors_wxyz, separation_deg.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Self
+
+import numpy as np
+import yaml
+
+from generator.symmetry.atlas import SCHEMES, Scheme, separation_deg
+from generator.symmetry.groups import SymmetryGroup
+from generator.symmetry.mapping import CanonicalMap
+from generator.symmetry.point_groups import parse_name
+
+Matrix = tuple[tuple[float, ...], ...]
+
+_TABLE_KEYS = ("scheme", "allocentric", "objects")
+_GIVEN_KEYS = ("group", "axis", "secondary_axis", "frame", "offset", "offset_mm", "reference_rotation")
+_DERIVED_KEYS = ("order", "n_regressors", "anchors_wxyz", "separation_deg")
+_BOP_SIZES = tuple(f"{what}_{axis}" for what in ("min", "max", "size") for axis in "xyz")
+_BOP_KEYS = ("symmetries_discrete", "symmetries_continuous", "diameter", *_BOP_SIZES)
+_OBJECT_KEY = re.compile(r"(?:object\s*|obj_?)?0*(\d+)", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class SymmetryEntry:
+    """One object's symmetries.
+
+    Attributes:
+        group: the symmetry group.
+        reference_rotation: what the first regressor is centred on, three rows of three; None for the identity.
+    """
+
+    group: SymmetryGroup
+    reference_rotation: Matrix | None = None
+
+    def canonical_map(self, scheme: Scheme, allocentric: bool = False, decimals: int = 9) -> CanonicalMap:
+        """The map that labels this object's poses."""
+        return CanonicalMap(self.group, scheme, self.reference_rotation, allocentric, decimals)
+
+
+@dataclass(frozen=True)
+class SymmetryTable:
+    """The symmetries of all objects and the scheme they are labelled by.
+
+    Attributes:
+        entries: by object id, ascending.
+        scheme: `pitteri2019` or `atlas`.
+        allocentric: whether rotations are judged relative to the ray to the object (see `CanonicalMap`).
+    """
+
+    entries: Mapping[int, SymmetryEntry]
+    scheme: Scheme = "pitteri2019"
+    allocentric: bool = False
+
+    def __post_init__(self) -> None:
+        _check_scheme(self.scheme)
+        ordered = {obj_id: self.entries[obj_id] for obj_id in sorted(self.entries)}
+        object.__setattr__(self, "entries", MappingProxyType(ordered))
+
+    @classmethod
+    def from_models_info(
+        cls, models_info: Mapping[Any, Mapping[str, Any]], scheme: Scheme = "pitteri2019", allocentric: bool = False
+    ) -> Self:
+        """The table of the groups that BOP's `models_info.json` declares (keys: object ids as int or str).
+
+        Raises:
+            ValueError: an entry that describes no rotation group, with the object's id.
+        """
+        entries = {}
+        for key, info in models_info.items():
+            obj_id = _object_id(key)
+            try:
+                entries[obj_id] = SymmetryEntry(SymmetryGroup.from_bop(info))
+            except ValueError as error:
+                raise ValueError(f"object {obj_id}: {error}") from error
+        return cls(entries, scheme, allocentric)
+
+    @classmethod
+    def from_dict(cls, data: object) -> Self:
+        """The table of parsed YAML or JSON, in either form of the module's description, or of a whole
+        `models_info.json`.
+
+        Raises:
+            ValueError: unknown keys or groups (with the nearest known name), or values that describe no rotation
+                group.
+        """
+        if not isinstance(data, Mapping):
+            raise ValueError(
+                "a symmetry table is a mapping of objects, such as 'object 26: {group: C2, axis: [0, 0, 1]}'"
+            )
+        objects = data.get("objects", {key: value for key, value in data.items() if key not in _TABLE_KEYS})
+        if "objects" in data:
+            _refuse_unknown(data, _TABLE_KEYS, "the symmetry table")
+        if not isinstance(objects, Mapping):
+            raise ValueError(f"objects is {objects!r}, not a mapping of object ids to groups")
+        scheme, allocentric = data.get("scheme", SCHEMES[0]), data.get("allocentric", False)
+        _check_scheme(scheme)
+        if not isinstance(allocentric, bool):
+            raise ValueError(f"allocentric is {allocentric!r}, not true or false")
+        entries: dict[int, SymmetryEntry] = {}
+        for key, value in objects.items():
+            obj_id = _object_id(key)
+            if obj_id in entries:
+                raise ValueError(f"object {obj_id} is listed twice")
+            try:
+                entries[obj_id] = _entry(value, scheme)
+            except ValueError as error:
+                raise ValueError(f"object {obj_id}: {error}") from error
+        return cls(entries, scheme, allocentric)
+
+    @classmethod
+    def read(cls, path: str | Path) -> Self:
+        """The table in a YAML or JSON file.
+
+        Raises:
+            ValueError: the file cannot be read, is neither JSON nor YAML, or what `from_dict` refuses; with the file's
+                name.
+        """
+        try:
+            return cls.from_dict(_parsed(Path(path).read_text(encoding="utf-8")))
+        except OSError as error:
+            raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+
+    def write(self, path: str | Path) -> None:
+        """Write the table as JSON (which is YAML as well), always the same bytes, whole or not at all."""
+        path = Path(path)
+        head = [f'"scheme": {json.dumps(self.scheme)}', f'"allocentric": {json.dumps(self.allocentric)}']
+        lines = [f"  {json.dumps(key)}: {json.dumps(entry)}" for key, entry in self.to_dict()["objects"].items()]
+        text = "{\n" + ",\n".join(head) + ',\n"objects": {\n' + ",\n".join(lines) + "\n}}\n"
+        partial = path.with_name(path.name + ".part")
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `write` writes: plain dicts, lists and numbers."""
+        objects = {str(obj_id): self._described(entry) for obj_id, entry in self.entries.items()}
+        return {"scheme": self.scheme, "allocentric": self.allocentric, "objects": objects}
+
+    def digest(self) -> str:
+        """SHA-256 (hex) of the table's canonical JSON: equal digests, equal labels."""
+        return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
+
+    def canonical_map(self, obj_id: int, decimals: int = 9) -> CanonicalMap:
+        """The map that labels an object's poses.
+
+        Raises:
+            ValueError: the table does not have the object.
+        """
+        if obj_id not in self.entries:
+            raise ValueError(f"object {obj_id} is not in the symmetry table, which has {_listed(self.entries)}")
+        return self.entries[obj_id].canonical_map(self.scheme, self.allocentric, decimals)
+
+    def _described(self, entry: SymmetryEntry) -> dict[str, Any]:
+        group = entry.group
+        described: dict[str, Any] = {"group": group.name}
+        described |= {"axis": None if group.axis is None else list(group.axis)}
+        if group.secondary_axis is not None:
+            described["secondary_axis"] = list(group.secondary_axis)
+        described["offset_mm"] = list(group.offset_mm)
+        if entry.reference_rotation is not None:
+            described["reference_rotation"] = [list(row) for row in entry.reference_rotation]
+        return described | _derived(entry, self.scheme)
+
+
+def _derived(entry: SymmetryEntry, scheme: Scheme) -> dict[str, Any]:
+    canonical = entry.canonical_map(scheme)
+    return {
+        "order": int(entry.group.order) if entry.group.is_finite else "infinite",
+        "n_regressors": canonical.n_regressors,
+        "anchors_wxyz": canonical.anchors_wxyz.tolist(),
+        "separation_deg": separation_deg(parse_name(entry.group.name), scheme),
+    }
+
+
+def _entry(value: object, scheme: Scheme) -> SymmetryEntry:
+    if isinstance(value, str):
+        return SymmetryEntry(SymmetryGroup.from_name(value))
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{value!r} describes no symmetries; write for example {{group: C2, axis: [0, 0, 1]}}")
+    if "group" not in value and value.keys() <= set(_BOP_KEYS):
+        return SymmetryEntry(SymmetryGroup.from_bop(value))
+    _refuse_unknown(value, _GIVEN_KEYS + _DERIVED_KEYS, "it")
+    if "group" not in value:
+        raise ValueError("it has no group; write for example {group: C2, axis: [0, 0, 1]}")
+    if "offset" in value and "offset_mm" in value:
+        raise ValueError("offset and offset_mm are the same thing: give one of them")
+    offset = value.get("offset_mm", value.get("offset"))
+    group = SymmetryGroup.from_name(
+        value["group"],
+        axis=value.get("axis"),
+        secondary_axis=value.get("secondary_axis"),
+        offset_mm=(0, 0, 0) if offset is None else offset,
+        frame=value.get("frame"),
+    )
+    entry = SymmetryEntry(group, _reference(value.get("reference_rotation")))
+    _check_derived(value, _derived(entry, scheme))
+    return entry
+
+
+def _reference(value: object) -> Matrix | None:
+    if value is None:
+        return None
+    try:
+        matrix = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.size != 9:
+        raise ValueError(f"reference_rotation is {value!r}, not 3 rows of 3 numbers")
+    rows = matrix.reshape(3, 3)
+    CanonicalMap(SymmetryGroup.trivial(), reference_rotation=rows)  # refuses what is no rotation
+    return tuple(tuple(float(number) for number in row) for row in rows)
+
+
+def _check_derived(given: Mapping[Any, Any], expected: Mapping[str, Any]) -> None:
+    """A file whose group was edited must not keep saying what followed from the former one."""
+    for key in _DERIVED_KEYS:
+        if key in given and not _agree(given[key], expected[key]):
+            raise ValueError(f"{key} does not follow from the group and scheme: leave {', '.join(_DERIVED_KEYS)} out")
+
+
+def _agree(a: object, b: object) -> bool:
+    if isinstance(a, str) or isinstance(b, str):
+        return a == b
+    try:
+        left, right = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    except (TypeError, ValueError):
+        return False
+    return left.shape == right.shape and bool(np.allclose(left, right, atol=1e-9))
+
+
+def _object_id(key: object) -> int:
+    matched = _OBJECT_KEY.fullmatch(str(key).strip())
+    if matched is None:
+        raise ValueError(f"{key!r} names no object: write 'object 26' or 26{_suggestion(str(key), _TABLE_KEYS)}")
+    return int(matched[1])
+
+
+def _refuse_unknown(mapping: Mapping[Any, Any], known: Iterable[str], where: str) -> None:
+    for key in mapping:
+        if key not in known:
+            raise ValueError(f"{where} has the unknown key {str(key)!r}{_suggestion(str(key), known)}")
+
+
+def _suggestion(word: str, known: Iterable[str]) -> str:
+    nearest = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
+    return f": did you mean {nearest[0]!r}?" if nearest else ""
+
+
+def _check_scheme(scheme: object) -> None:
+    if scheme not in SCHEMES:
+        raise ValueError(f"unknown scheme {scheme!r}: use one of {', '.join(SCHEMES)}")
+
+
+def _listed(ids: Iterable[int]) -> str:
+    text = ", ".join(map(str, ids))
+    return f"objects {text}" if text else "no objects"
+
+
+def _parsed(text: str) -> object:
+    # JSON first: YAML 1.1 reads 1e-06 as a word.
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        pass
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ValueError(f"neither JSON nor YAML ({' '.join(str(error).split())})") from error

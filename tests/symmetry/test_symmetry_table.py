@@ -1,0 +1,135 @@
+"""The symmetry table: as a person writes it, as a dataset keeps it, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from symmetry_cases import ALL, SCHEMES, in_random_frame, random_rotations, seeds
+
+from generator.symmetry import SymmetryEntry, SymmetryGroup, SymmetryTable
+
+BY_HAND = """
+object 26: {group: C2, axis: [0, 0, 1], offset: [-7, 0, 0]}
+27: {group: C4}
+"obj_000028": C1
+object 3:
+  group: D3
+  axis: [0, 1, 0]
+  secondary_axis: [1, 0, 0]
+  reference_rotation: [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+"""
+
+
+def read(tmp_path: Path, text: str) -> SymmetryTable:
+    path = tmp_path / "symmetries.yaml"
+    path.write_text(text)
+    return SymmetryTable.read(path)
+
+
+def test_a_table_written_by_hand(tmp_path: Path) -> None:
+    table = read(tmp_path, BY_HAND)
+    assert list(table.entries) == [3, 26, 27, 28]
+    assert table.scheme == "pitteri2019"
+    assert table.entries[26].group == SymmetryGroup.from_name("C2", axis=(0, 0, 1), offset_mm=(-7, 0, 0))
+    assert table.entries[27].group.name == "C4"
+    assert table.entries[28].group == SymmetryGroup.trivial()
+    assert table.entries[3].reference_rotation == ((0, -1, 0), (1, 0, 0), (0, 0, 1))
+    np.testing.assert_allclose(np.abs(table.canonical_map(3).anchors_wxyz[0]), [0.5**0.5, 0, 0, 0.5**0.5])
+    assert read(tmp_path, "scheme: atlas\nobjects: {1: {group: SO(2)}}").canonical_map(1).n_regressors == 2
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=seeds)
+def test_the_file_gives_the_table_back_exactly(seed: int, tmp_path_factory: pytest.TempPathFactory) -> None:
+    rng = np.random.default_rng(seed)
+    references = [None if i % 2 else tuple(map(tuple, random_rotations(rng, 1)[0].tolist())) for i in range(len(ALL))]
+    entries = {i + 1: SymmetryEntry(in_random_frame(name, rng), references[i]) for i, name in enumerate(ALL)}
+    table = SymmetryTable(entries, SCHEMES[seed % 2], bool(seed % 3))
+    path = tmp_path_factory.mktemp("table") / "symmetries.json"
+    table.write(path)
+    first = path.read_bytes()
+    back = SymmetryTable.read(path)
+    assert back == table
+    assert back.digest() == table.digest()
+    back.write(path)
+    assert path.read_bytes() == first
+    assert list(path.parent.iterdir()) == [path]
+    for obj_id in entries:
+        np.testing.assert_array_equal(back.canonical_map(obj_id).anchors_wxyz, table.canonical_map(obj_id).anchors_wxyz)
+
+
+def test_what_the_file_says() -> None:
+    table = SymmetryTable({26: SymmetryEntry(SymmetryGroup.from_name("C2", offset_mm=(-7, 0, 0)))}, "atlas")
+    entry = table.to_dict()["objects"]["26"]
+    assert entry["group"] == "C2"
+    assert entry["axis"] == [0, 0, 1]
+    assert entry["offset_mm"] == [-7, 0, 0]
+    assert (entry["order"], entry["n_regressors"]) == (2, 4)
+    assert entry["separation_deg"] == pytest.approx(62.8, abs=0.01)
+    np.testing.assert_allclose(
+        entry["anchors_wxyz"],
+        [[1, 0, 0, 0], [0.5**0.5, 0, 0, 0.5**0.5], [0, 1, 0, 0], [0, 0.5**0.5, -(0.5**0.5), 0]],
+        atol=1e-12,
+    )
+
+
+def test_digests_tell_tables_apart() -> None:
+    def table(name: str, scheme: str = "pitteri2019", allocentric: bool = False) -> SymmetryTable:
+        return SymmetryTable({1: SymmetryEntry(SymmetryGroup.from_name(name))}, scheme, allocentric)
+
+    tables = [table("C2"), table("C3"), table("C2", "atlas"), table("C2", allocentric=True)]
+    assert len({t.digest() for t in tables}) == 4
+    assert table("C2").digest() == tables[0].digest()
+
+
+def test_tless_models_info_is_a_table_too(tless_models: Path) -> None:
+    path = tless_models / "models_info.json"
+    table = SymmetryTable.from_models_info(json.loads(path.read_text()), "atlas")
+    assert list(table.entries) == list(range(1, 31))
+    assert dict(table.entries) == dict(SymmetryTable.read(path).entries)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("26: {group: C2, axes: [0, 0, 1]}", "object 26: it has the unknown key 'axes': did you mean 'axis'"),
+        ("26: {group: c2}", "object 26: unknown symmetry group 'c2': did you mean 'C2'"),
+        ("26: {group: C0}", "order 0"),
+        ("26: {group: C2, axis: [0, 0, 0]}", "object 26: C2: axis is zero"),
+        ("26: {group: C2, offset: [1, 2]}", "not 3 finite numbers"),
+        ("26: {group: C2, offset: [1, 2, 3], offset_mm: [1, 2, 3]}", "give one of them"),
+        ("26: {axis: [0, 0, 1]}", "no group"),
+        ("26: 7", "describes no symmetries"),
+        ("26: {group: C2, reference_rotation: [1, 0, 0, 0, 1, 0, 0, 0, -1]}", "reflection"),
+        ("26: {group: C2, reference_rotation: [1, 0, 0]}", "3 rows of 3"),
+        ("26: {group: D3, frame: [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}", "reflection"),
+        ("26: {group: C2, order: 3}", "order does not follow"),
+        ("26: {group: C2, anchors_wxyz: [[1, 0, 0, 0]]}", "anchors_wxyz does not follow"),
+        ("26: {symmetries_discrete: [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1]]}", "object 26: .*reflection"),
+        ("26: {group: C2}\nobject 26: {group: C3}", "object 26 is listed twice"),
+        ("widget: {group: C2}", "'widget' names no object"),
+        ("schema: atlas", "did you mean 'scheme'"),
+        ("scheme: pitteri\nobjects: {}", "unknown scheme 'pitteri'"),
+        ("allocentric: maybe\nobjects: {}", "allocentric is 'maybe'"),
+        ("objects: [1]", "not a mapping"),
+        ("[1, 2]", "is a mapping"),
+        ("a: [", "neither JSON nor YAML"),
+        ('{"objects": {"26": {"group": "C2"', "neither JSON nor YAML"),
+    ],
+)
+def test_wrong_tables_are_refused_in_one_line_with_the_file(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        read(tmp_path, text)
+    assert "symmetries.yaml" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_and_objects_that_are_not_there(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"none\.json: cannot be read"):
+        SymmetryTable.read(tmp_path / "none.json")
+    with pytest.raises(ValueError, match="object 5 is not in the symmetry table, which has objects 26"):
+        SymmetryTable({26: SymmetryEntry(SymmetryGroup.trivial())}).canonical_map(5)
