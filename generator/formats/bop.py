@@ -82,6 +82,22 @@ class ScenePaths:
         return self.root / "scene_spec.jsonl"
 
 
+def find_split(dataset: Path) -> str:
+    """The split of a dataset that has only one.
+
+    Raises:
+        ValueError: the folder is no BOP dataset, or has several splits.
+    """
+    if not dataset.is_dir():
+        raise ValueError(f"{dataset}: no such dataset folder")
+    splits = sorted({path.parent.parent.name for path in dataset.glob("*/*/scene_camera.json")})
+    if not splits:
+        raise ValueError(f"{dataset}: no BOP dataset; {SPLIT}/000001/scene_camera.json or the like is needed")
+    if len(splits) > 1:
+        raise ValueError(f"{dataset}: has the splits {', '.join(splits)}; name one of them")
+    return splits[0]
+
+
 def scene_ids(dataset: Path, split: str = SPLIT) -> list[int]:
     """The scenes of a split, ascending.
 
@@ -252,7 +268,7 @@ def scene_gt_coco(
             {"id": obj_id, "name": str(obj_id), "supercategory": dataset_name} for obj_id in sorted(set(obj_ids))
         ],
         "images": list(images),
-        "info": {"contributor": "", "description": f"{dataset_name}_{SPLIT}", "url": "", "version": "0.1.0"},
+        "info": {"contributor": "", "description": dataset_name, "url": "", "version": "0.1.0"},
         "licenses": [],
     }
 

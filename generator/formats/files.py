@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -42,6 +43,28 @@ def atomic_write(path: Path, data: bytes, durable: bool = False) -> None:
     """Write a whole file at once; arguments and errors as in ``atomic_file``."""
     with atomic_file(path, durable) as file:
         file.write(data)
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """A folder to fill, which becomes ``path`` when the block ends well and vanishes otherwise.
+
+    Raises:
+        ValueError: ``path`` is a file or a folder that holds something, or cannot be written.
+    """
+    path = path.resolve()
+    draft = path.with_name(f".{path.name}.part")
+    try:
+        if path.is_file() or (path.is_dir() and any(path.iterdir())):
+            raise ValueError(f"{path}: exists already; give a new or an empty folder")
+        shutil.rmtree(draft, ignore_errors=True)
+        draft.mkdir(parents=True)
+        yield draft
+        draft.replace(path)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
