@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries demo test lint format parts bench clean
+.PHONY: help setup system-libraries demo test lint format parts docs bench clean
 
 help:  ## this menu
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-18s %s\n", $$1, $$2}'
@@ -37,6 +37,9 @@ format: setup  ## let ruff rewrite what it can
 
 parts: setup  ## model the built-in parts again (assets/parts)
 	$(BIN)/python -m assets.parts.build
+
+docs: setup  ## write docs/recipe.md from the recipe's schema
+	$(BIN)/python -c "from generator.config import recipe_page; print(recipe_page(), end='')" > docs/recipe.md
 
 bench: setup  ## measure (see benchmarks/)
 	@set -e; for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script; done

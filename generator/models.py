@@ -132,9 +132,9 @@ def _read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
         mesh = trimesh.load(path, process=False)
     except Exception as error:  # trimesh raises whatever its parser stumbles over
         raise ModelError(f"{path}: not a readable PLY file ({_first_line(error)})") from None
-    faces = getattr(mesh, "faces", None)
-    if faces is None or len(faces) == 0:
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise ModelError(f"{path}: holds no faces; a triangle mesh is needed")
+    faces = np.asarray(mesh.faces)
     vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
     if not np.isfinite(vertices).all():
         bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])

@@ -1,0 +1,230 @@
+"""The recipe: one tree of settings that is the YAML file, the ``--set`` overrides and what a dataset records.
+
+Settings of the scene itself live in :mod:`scenes.settings`; this adds the seed, the sources, the files written and
+the labels, and reads, overrides and documents the whole tree.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import yaml
+from pydantic import Field, ValidationError
+
+from scenes.settings import Bounds, SceneSettings, Settings
+from scenes.spec import Intrinsics
+
+BUILTIN = "builtin"
+Output = Literal["rgb", "depth", "masks", "normals", "object_coordinates", "exr"]
+
+
+_EXPECTED = {"tuple_type": "expected a list, such as [min, max]", "model_type": "expected a mapping of settings"}
+"""Faults whose wording by pydantic would speak of Python instead of the recipe."""
+
+
+class RecipeError(ValueError):
+    """A recipe or an override that cannot be used; the message is one line."""
+
+
+class SourceSettings(Settings):
+    """Where models and textures come from."""
+
+    models: str = BUILTIN
+    """BOP models folder (obj_000001.ply, ..., models_info.json), or builtin."""
+    distractors: str | None = None
+    """BOP models folder of unlabelled objects."""
+    textures: str = BUILTIN
+    """Folder of photographs for the table, or builtin."""
+    licence: str = ""
+    """Licence and attribution of the models, recorded with the dataset."""
+
+
+class EncodingSettings(Settings):
+    """How the files of an image are encoded."""
+
+    rgb_format: Literal["png", "jpg"] = "png"
+    """Image format of rgb: png keeps what was rendered, jpg is smaller."""
+    jpeg_quality: Annotated[int, Bounds(1, 100)] = 95
+    """Quality of jpg files."""
+    depth_scale: Annotated[float, Bounds(0.001, 100, "mm")] = 0.1
+    """Millimetres per unit of the depth files."""
+
+
+class LabelSettings(Settings):
+    """How poses become labels."""
+
+    scheme: Literal["pitteri2019", "atlas"] = "pitteri2019"
+    """Canonical map and regressor index: the paper's, or the atlas that has no jumps."""
+    visibility_delta_mm: Annotated[float, Bounds(0, 100, "mm")] = 0.0
+    """A surface this close behind another still counts as visible; 0 is exact."""
+
+
+class Recipe(SceneSettings):
+    """Everything that decides a dataset."""
+
+    name: str = "synthetless"
+    """Name of the dataset, recorded with it."""
+    split: Annotated[str, Field(pattern=r"^[A-Za-z0-9_]+$")] = "train_synthetless"
+    """Name of the split's folder."""
+    images: Annotated[int, Bounds(1, 100_000_000, "images")] = 30000
+    """How many images to make."""
+    seed: Annotated[int, Bounds(0, 2**63 - 1)] = 0
+    """Everything random follows from it."""
+    source: SourceSettings = Field(default_factory=SourceSettings)
+    """Models and textures."""
+    outputs: tuple[Output, ...] = ("rgb", "depth", "masks")
+    """Files written for each image: any of rgb, depth, masks, normals, object_coordinates, exr (the linear image)."""
+    encoding: EncodingSettings = Field(default_factory=EncodingSettings)
+    """How they are encoded."""
+    labels: LabelSettings = Field(default_factory=LabelSettings)
+    """Canonical poses."""
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """The camera's pinhole model."""
+        camera = self.camera
+        return Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One leaf of the recipe, for help texts."""
+
+    key: str
+    kind: str
+    default: Any
+    description: str
+
+
+def load_recipe(path: Path | None, overrides: Sequence[str] = ()) -> Recipe:
+    """Read a recipe and apply ``key.path=value`` overrides (values are YAML).
+
+    Raises:
+        RecipeError: unreadable file, no mapping, unknown key, value of the wrong kind or outside its range.
+    """
+    tree: dict[str, Any] = {} if path is None else _read_yaml(path)
+    origin = "recipe" if path is None else str(path)
+    for override in overrides:
+        _apply(tree, override)
+    try:
+        return Recipe.model_validate(tree)
+    except ValidationError as error:
+        raise RecipeError(f"{origin}: {_explain(error)}") from None
+
+
+def dump_recipe(recipe: Recipe) -> dict[str, Any]:
+    """The whole tree as plain JSON values, defaults included."""
+    return recipe.model_dump(mode="json")
+
+
+def settings(group: type[Settings] = Recipe, prefix: str = "") -> Iterator[Setting]:
+    """All leaves of the recipe: a group's own first, then those of the groups inside it."""
+    inner: list[tuple[str, type[Settings]]] = []
+    for name, field in group.model_fields.items():
+        key, kind = f"{prefix}{name}", field.annotation
+        if isinstance(kind, type) and issubclass(kind, Settings):
+            inner.append((key, kind))
+        else:
+            yield Setting(key, _kind(kind, field.metadata), field.get_default(), field.description or "")
+    for key, kind in inner:
+        yield from settings(kind, f"{key}.")
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise RecipeError(f"{path}: no such recipe file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecipeError(f"{path}: cannot be read ({' '.join(str(error).split())})") from None
+    except yaml.YAMLError as error:
+        raise RecipeError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise RecipeError(f"{path}: a recipe is a mapping of settings, not a {type(content).__name__}")
+    return content
+
+
+def _apply(tree: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    path = key.strip().split(".")
+    if not equals or not all(path):
+        raise RecipeError(f"--set {override}: expected key.path=value")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise RecipeError(f"--set {override}: {text!r} is not valid YAML") from None
+    node = tree
+    for name in path[:-1]:
+        child = node.setdefault(name, {})
+        if not isinstance(child, dict):
+            raise RecipeError(f"--set {override}: {name} is a single value, it has no settings inside")
+        node = child
+    node[path[-1]] = value
+
+
+def _explain(error: ValidationError) -> str:
+    """The first fault in one line: key, value, what would be right."""
+    fault = error.errors(include_url=False)[0]
+    key = ".".join(str(part) for part in fault["loc"])
+    if fault["type"] == "extra_forbidden":
+        known = [setting.key for setting in settings()]
+        groups = sorted({".".join(k.split(".")[:-1]) for k in known} - {""})
+        return f"{key} is no setting{_nearest(key, known + groups)}"
+    value = fault["input"]
+    detail = _EXPECTED.get(fault["type"]) or fault["msg"][0].lower() + fault["msg"][1:]
+    more = len(error.errors()) - 1
+    suffix = f" (and {more} more)" if more else ""
+    return f"{key} = {value!r}: {detail}{suffix}"
+
+
+def _nearest(key: str, known: list[str]) -> str:
+    leaf = key.rsplit(".", maxsplit=1)[-1]
+    by_leaf = {k.rsplit(".", maxsplit=1)[-1]: k for k in reversed(known)}
+    match = [by_leaf[leaf]] if leaf in by_leaf else difflib.get_close_matches(key, known, n=1, cutoff=0.75)
+    match = match or [by_leaf[k] for k in difflib.get_close_matches(leaf, by_leaf, n=1)]
+    return f"; did you mean {match[0]}?" if match else "; see docs/recipe.md for all settings"
+
+
+def _kind(annotation: Any, metadata: Sequence[Any]) -> str:
+    """How the value is written: choices, range or number with its bounds and unit."""
+    bounds = next((str(item) for item in metadata if isinstance(item, Bounds)), "")
+    arguments = get_args(annotation)
+    if arguments and all(isinstance(item, str) for item in arguments):
+        return " | ".join(arguments)
+    if len(arguments) == 2 and arguments[0] is arguments[1] and Ellipsis not in arguments:
+        return f"[min, max] in {bounds}"
+    if bounds:
+        return ("integer in " if annotation is int else "number in ") + bounds
+    if annotation is str or str in arguments:
+        return "text"
+    return "list"
+
+
+def recipe_page() -> str:
+    """The reference page of all settings, as Markdown."""
+    lines = [
+        "# The recipe",
+        "",
+        "A recipe is a YAML file of the settings below; a setting that it leaves out has its default. On the command",
+        "line, `--set camera.width=640` overrides one. A range is written `[min, max]`; values are drawn uniformly",
+        "between the two unless the setting says otherwise. `dataset.json` records the recipe as it was used.",
+        "",
+        "This page is written by `make docs`.",
+    ]
+    group = None
+    for setting in settings():
+        name = setting.key.rpartition(".")[0]
+        if name != group:
+            group = name
+            title = f"`{group}`" if group else "At the top"
+            lines += ["", f"## {title}", "", "| setting | value | default | meaning |", "|---|---|---|---|"]
+        kind = setting.kind.replace("|", "\\|")
+        lines.append(f"| `{setting.key}` | {kind} | `{json.dumps(setting.default)}` | {setting.description} |")
+    return "\n".join(lines) + "\n"

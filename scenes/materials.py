@@ -1,0 +1,81 @@
+"""What things are made of: grey plastic, and a textured table."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenes.spec import Material, PlaneSpec
+
+
+def plastic(bpy: Any, material: Material) -> Any:
+    """A bpy material of one colour."""
+    made, nodes, links = _empty_material(bpy, "plastic")
+    shader = _surface(nodes, links, material.roughness, material.specular)
+    shader.inputs[0].default_value = (*material.albedo, 1.0)
+    return made
+
+
+def textured(bpy: Any, plane: PlaneSpec, image: Any, seamless: bool) -> Any:
+    """A bpy material that repeats an image over the surface; one that is not seamless is mirrored at its borders."""
+    made, nodes, links = _empty_material(bpy, "table")
+    shader = _surface(nodes, links, plane.roughness, plane.specular)
+    texture = nodes.new("ShaderNodeTexImage")
+    texture.image = image
+    texture.extension = "REPEAT" if seamless else "MIRROR"
+    links.new(texture.outputs["Color"], shader.inputs[0])
+    return made
+
+
+def add_table(bpy: Any, collection: Any, plane: PlaneSpec, size_m: float, material: Any, aspect: float) -> Any:
+    """Add the square table in z = 0 to a bpy collection; ``aspect`` is the texture's width over its height."""
+    half = size_m / 2
+    corners = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
+    mesh = bpy.data.meshes.new("table")
+    mesh.from_pydata([(x, y, 0.0) for x, y in corners], [], [(0, 1, 2, 3)])
+    uv = mesh.uv_layers.new(name="uv")
+    uv.data.foreach_set("uv", table_uv(plane, corners, aspect).astype(np.float32).ravel())
+    mesh.materials.append(material)
+    table = bpy.data.objects.new("table", mesh)
+    collection.objects.link(table)
+    return table
+
+
+def table_uv(plane: PlaneSpec, points_m: NDArray[np.float64], aspect: float) -> NDArray[np.float64]:
+    """(N, 2) texture coordinates of (N, 2) points of the table: turned, scaled to tiles, and shifted."""
+    angle = math.radians(plane.rotation_deg)
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    uv: NDArray[np.float64] = points_m @ turn.T / (plane.tile_m * np.array([aspect, 1.0])) + plane.shift
+    return uv
+
+
+def new_image(bpy: Any, pixels: NDArray[np.uint8]) -> Any:
+    """A bpy image of (H, W, 3) sRGB pixels, first row on top."""
+    height, width, _ = pixels.shape
+    image = bpy.data.images.new("texture", width, height, alpha=False)
+    rgba = np.ones((height, width, 4), dtype=np.float32)
+    np.divide(pixels[::-1], np.float32(255), out=rgba[..., :3])
+    image.pixels.foreach_set(rgba.ravel())
+    return image
+
+
+def _empty_material(bpy: Any, name: str) -> tuple[Any, Any, Any]:
+    made = bpy.data.materials.new(name)
+    made.use_nodes = True
+    tree = made.node_tree
+    tree.nodes.clear()
+    return made, tree.nodes, tree.links
+
+
+def _surface(nodes: Any, links: Any, roughness: float, specular: float) -> Any:
+    """The surface shader, colour as its first input: purely diffuse where nothing shines, since that renders faster."""
+    shader = nodes.new("ShaderNodeBsdfPrincipled" if specular > 0 else "ShaderNodeBsdfDiffuse")
+    if specular > 0:
+        shader.inputs["Roughness"].default_value = roughness
+        shader.inputs["Specular IOR Level"].default_value = specular
+    output = nodes.new("ShaderNodeOutputMaterial")
+    links.new(shader.outputs[0], output.inputs["Surface"])
+    return shader

@@ -1,0 +1,202 @@
+"""Cycles: from a settled scene to a linear image."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenes import blender, camera, lights, materials
+from scenes.mesh import Mesh
+from scenes.rotations import matrix
+from scenes.settings import RenderSettings
+from scenes.spec import Intrinsics, Pose, Role, SceneSpec
+from scenes.textures import PhotoTexture, load_photo, procedural_image
+
+_CREASE_DEG = 30.0
+"""Edges sharper than this are shaded as edges."""
+
+
+@dataclass(eq=False)
+class Stage:
+    """A Blender session that scenes are built on; meshes are loaded once and kept. At most one per process is in use.
+
+    Attributes:
+        meshes: every model that may appear, by role and object id.
+        intrinsics: of the camera.
+        settings: of the renderer.
+        table_size_m: side of the table.
+        photos: folder of the photographs, None if only built-in textures are used.
+        threads: of the renderer; 0 uses every core.
+        log: file that takes Blender's console output.
+    """
+
+    meshes: Mapping[tuple[Role, int], Mesh]
+    intrinsics: Intrinsics
+    settings: RenderSettings
+    table_size_m: float
+    photos: Path | None = None
+    threads: int = 0
+    log: Path = Path(os.devnull)
+    _loaded: dict[tuple[Role, int], Any] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        self.bpy = blender.start(self.threads)
+        _configure(self.bpy.context.scene, self.settings)
+
+    @contextlib.contextmanager
+    def scene(self, spec: SceneSpec, settled: Sequence[Pose]) -> Iterator[BuiltScene]:
+        """Build a scene, and take it apart again at the end.
+
+        Args:
+            spec: what to build.
+            settled: pose of each object of ``spec`` at rest.
+
+        Raises:
+            ValueError: the photograph of the table cannot be read.
+        """
+        bpy_scene = self.bpy.context.scene
+        collection = bpy_scene.collection
+        centre_m = centre(settled)
+        try:
+            lights.add_ambient(self.bpy, bpy_scene, spec.ambient)
+            lights.add_lamp(self.bpy, collection, spec.light, centre_m)
+            self._add_table(collection, spec)
+            for number, (item, pose) in enumerate(zip(spec.objects, settled, strict=True)):
+                placed = self.bpy.data.objects.new(f"object {number}", self._mesh(item.role, item.obj_id))
+                placed.matrix_world = _transform(pose)
+                placed.pass_index = number + 1
+                collection.objects.link(placed)
+                placed.material_slots[0].link = "OBJECT"  # the mesh is shared, the grey is not
+                placed.material_slots[0].material = materials.plastic(self.bpy, item.material)
+            data = self.bpy.data.cameras.new("camera")
+            bpy_scene.camera = self.bpy.data.objects.new("camera", data)
+            collection.objects.link(bpy_scene.camera)
+            camera.set_intrinsics(bpy_scene, bpy_scene.camera, self.intrinsics)
+            yield BuiltScene(self, spec, centre_m)
+        finally:
+            blender.clear(self.bpy, keep=set(self._loaded.values()))
+
+    def _add_table(self, collection: Any, spec: SceneSpec) -> None:
+        texture = spec.plane.texture
+        if isinstance(texture, PhotoTexture):
+            if self.photos is None:
+                raise ValueError(f"the scene needs the photograph {texture.file}, but no textures folder is given")
+            pixels = load_photo(self.photos, texture.file)
+        else:
+            pixels = procedural_image(texture)
+        image = materials.new_image(self.bpy, pixels)
+        seamless = not isinstance(texture, PhotoTexture)
+        material = materials.textured(self.bpy, spec.plane, image, seamless)
+        aspect = pixels.shape[1] / pixels.shape[0]
+        materials.add_table(self.bpy, collection, spec.plane, self.table_size_m, material, aspect)
+
+    def _mesh(self, role: Role, obj_id: int) -> Any:
+        key = (role, obj_id)
+        if key not in self._loaded:
+            self._loaded[key] = _load_mesh(self.bpy, self.meshes[key])
+        return self._loaded[key]
+
+
+@dataclass(frozen=True, eq=False)
+class BuiltScene:
+    """A scene that stands on a stage.
+
+    Attributes:
+        stage: where it stands.
+        spec: what it was built from.
+        centre_m: (3,) centre of its objects, world frame.
+    """
+
+    stage: Stage
+    spec: SceneSpec
+    centre_m: NDArray[np.float64]
+
+    def extrinsics(self, view: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """R_w2c (3, 3) and t_w2c (3,) in metres of the given view."""
+        return camera.extrinsics(self.spec.views[view], self.centre_m)
+
+    def render(self, view: int) -> NDArray[np.float32]:
+        """Linear image (H, W, 3), Rec. 709 primaries, of the given view."""
+        scene = self.stage.bpy.context.scene
+        camera.place(scene.camera, *self.extrinsics(view))
+        scene.cycles.seed = (self.spec.drop * len(self.spec.views) + view) % 2**31
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "image.exr"
+            scene.render.filepath = str(file)
+            with blender.console_to(self.stage.log):
+                self.stage.bpy.ops.render.render(write_still=True)
+            return read_exr(file)
+
+
+def centre(settled: Sequence[Pose]) -> NDArray[np.float64]:
+    """(3,) mean of the objects' positions, metres."""
+    mean: NDArray[np.float64] = np.array([pose.position_m for pose in settled], dtype=np.float64).mean(axis=0)
+    return mean
+
+
+def read_exr(file: Path) -> NDArray[np.float32]:
+    """(H, W, 3) float32 colour channels of an OpenEXR file."""
+    import OpenEXR
+
+    with OpenEXR.File(str(file)) as content:
+        pixels: NDArray[np.float32] = content.channels()["RGB"].pixels
+    return pixels.astype(np.float32)
+
+
+def _configure(scene: Any, settings: RenderSettings) -> None:
+    scene.render.engine = "CYCLES"
+    cycles = scene.cycles
+    cycles.device = "CPU"
+    cycles.samples = settings.samples
+    cycles.use_adaptive_sampling = False  # gains nothing at these sample counts
+    cycles.max_bounces = settings.bounces
+    cycles.diffuse_bounces = cycles.glossy_bounces = settings.bounces
+    cycles.transmission_bounces = cycles.volume_bounces = cycles.transparent_max_bounces = 0
+    cycles.caustics_reflective = cycles.caustics_refractive = False  # they are what fireflies are made of
+    cycles.use_denoising = settings.denoiser != "none"
+    cycles.denoiser = "OPENIMAGEDENOISE"
+    cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
+    cycles.denoising_quality = "HIGH"
+    cycles.denoising_prefilter = "ACCURATE" if settings.denoiser == "accurate" else "NONE"
+    scene.render.use_persistent_data = True
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    scene.render.image_settings.color_mode = "RGB"
+    scene.render.image_settings.color_depth = "32"
+    scene.render.image_settings.exr_codec = "NONE"
+    scene.render.use_compositing = scene.render.use_sequencer = False
+    scene.view_settings.view_transform = "Standard"
+
+
+def _load_mesh(bpy: Any, mesh: Mesh) -> Any:
+    """A bpy mesh with one material slot, smooth but for its creases."""
+    made = bpy.data.meshes.new("model")
+    count = len(mesh.faces)
+    made.vertices.add(len(mesh.vertices_m))
+    made.vertices.foreach_set("co", mesh.vertices_m.astype(np.float32).ravel())
+    made.loops.add(3 * count)
+    made.loops.foreach_set("vertex_index", mesh.faces.astype(np.int32).ravel())
+    made.polygons.add(count)
+    made.polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
+    made.polygons.foreach_set("use_smooth", np.ones(count, dtype=bool))
+    made.update(calc_edges=True)
+    made.set_sharp_from_angle(angle=math.radians(_CREASE_DEG))
+    made.materials.append(None)
+    return made
+
+
+def _transform(pose: Pose) -> Any:
+    from mathutils import Matrix
+
+    transform = np.eye(4)
+    transform[:3, :3] = matrix(pose.rotation_wxyz)
+    transform[:3, 3] = pose.position_m
+    return Matrix(transform.tolist())

@@ -1,0 +1,177 @@
+"""Draws scenes: settings, a seed and a drop number decide everything that is not left to physics.
+
+Each purpose has a random stream of its own, so that a change of one setting leaves all else as it was, and a
+second throw of the same drop changes only how the objects are let go.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from scenes.rotations import random_rotation
+from scenes.settings import (
+    CameraSettings,
+    FloatRange,
+    LightSettings,
+    ObjectSettings,
+    ReleaseSettings,
+    SceneSettings,
+    TableSettings,
+)
+from scenes.spec import (
+    AmbientLight,
+    Material,
+    ObjectSpec,
+    PlaneSpec,
+    PointLight,
+    Pose,
+    Role,
+    SceneSpec,
+    Vector,
+    View,
+)
+from scenes.textures import sample_texture
+
+_CANDLE = (1.0, 0.56, 0.17)
+"""Linear RGB of a black body at about 2000 K, largest component 1."""
+
+
+class Stream(IntEnum):
+    """One random stream per purpose; the numbers are part of every dataset's identity and never change."""
+
+    OBJECTS = 0
+    MATERIALS = 1
+    RELEASE = 2
+    PLANE = 3
+    LIGHT = 4
+    VIEWS = 5
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """What a scene can be made of.
+
+    Attributes:
+        models: diameter in metres of each labelled model, by object id.
+        distractors: the same of the unlabelled ones.
+        photos: names of the photographs for the table; empty means the built-in textures.
+    """
+
+    models: Mapping[int, float]
+    distractors: Mapping[int, float]
+    photos: Sequence[str] = ()
+
+
+def sample_scene(settings: SceneSettings, catalogue: Catalogue, seed: int, drop: int, attempt: int = 0) -> SceneSpec:
+    """Draw the scene of one drop.
+
+    Args:
+        settings: the ranges to draw from.
+        catalogue: models, distractors and photographs to draw from.
+        seed: of the dataset.
+        drop: number of the drop within the dataset.
+        attempt: number of the throw; only the release poses depend on it.
+
+    Returns:
+        The same scene for the same arguments, on every machine.
+    """
+
+    def stream(purpose: Stream, *further: int) -> np.random.Generator:
+        return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(drop, purpose, *further)))
+
+    chosen = _choose_objects(settings.objects, catalogue, stream(Stream.OBJECTS))
+    materials = stream(Stream.MATERIALS)
+    diameters = [(catalogue.models if role == "model" else catalogue.distractors)[i] for role, i in chosen]
+    releases = _release(settings.release, diameters, stream(Stream.RELEASE, attempt))
+    objects = tuple(
+        ObjectSpec(role, obj_id, _material(settings.objects, materials), pose)
+        for (role, obj_id), pose in zip(chosen, releases, strict=True)
+    )
+    light, ambient = _lights(settings.light, stream(Stream.LIGHT))
+    views = tuple(
+        _view(settings.camera, stream(Stream.VIEWS, number)) for number in range(settings.camera.views_per_drop)
+    )
+    plane = _plane(settings.table, catalogue.photos, stream(Stream.PLANE))
+    return SceneSpec(drop, attempt, objects, plane, light, ambient, views)
+
+
+def _uniform(rng: np.random.Generator, bounds: FloatRange) -> float:
+    return float(rng.uniform(*bounds))
+
+
+def _choose_objects(settings: ObjectSettings, catalogue: Catalogue, rng: np.random.Generator) -> list[tuple[Role, int]]:
+    """Labelled objects and distractors in random order, since who is released last lies on top."""
+
+    def draw(role: Role, ids: Mapping[int, float], count: tuple[int, int]) -> list[tuple[Role, int]]:
+        number = int(rng.integers(count[0], count[1], endpoint=True))
+        return [(role, int(i)) for i in rng.choice(sorted(ids), size=number)] if number else []
+
+    chosen = draw("model", catalogue.models, settings.count)
+    chosen += draw("distractor", catalogue.distractors, settings.distractors)
+    return [chosen[i] for i in rng.permutation(len(chosen))]
+
+
+def _linear(srgb: float) -> float:
+    """Linear value of a displayed one (IEC 61966-2-1)."""
+    return srgb / 12.92 if srgb <= 0.04045 else ((srgb + 0.055) / 1.055) ** 2.4
+
+
+def _material(settings: ObjectSettings, rng: np.random.Generator) -> Material:
+    grey = _uniform(rng, settings.grey)
+    deviations = rng.uniform(-settings.tint, settings.tint, size=3)
+    red, green, blue = (_linear(min(max(grey + d, 0.0), 1.0)) for d in deviations.tolist())
+    return Material((red, green, blue), _uniform(rng, settings.roughness), _uniform(rng, settings.specular))
+
+
+def _release(settings: ReleaseSettings, diameters_m: Sequence[float], rng: np.random.Generator) -> list[Pose]:
+    """One above the other, bounding spheres apart, spread over a disc."""
+    poses, floor = [], 0.0
+    for diameter in diameters_m:
+        rotation = random_rotation(rng)
+        radius, angle = settings.spread_m * math.sqrt(rng.uniform()), rng.uniform(0, 2 * math.pi)
+        height = floor + _uniform(rng, settings.clearance_m) + diameter / 2
+        floor = height + diameter / 2
+        poses.append(Pose(rotation, (radius * math.cos(angle), radius * math.sin(angle), height)))
+    return poses
+
+
+def _plane(settings: TableSettings, photos: Sequence[str], rng: np.random.Generator) -> PlaneSpec:
+    low, high = settings.tile_m
+    return PlaneSpec(
+        texture=sample_texture(rng, photos),
+        tile_m=float(math.exp(rng.uniform(math.log(low), math.log(high)))),
+        rotation_deg=float(rng.uniform(0, 360)),
+        shift=(float(rng.uniform()), float(rng.uniform())),
+        roughness=_uniform(rng, settings.roughness),
+        specular=_uniform(rng, settings.specular),
+    )
+
+
+def _lights(settings: LightSettings, rng: np.random.Generator) -> tuple[PointLight, AmbientLight]:
+    warmth = _uniform(rng, settings.warmth)
+    color: Vector = (1.0, 1 + warmth * (_CANDLE[1] - 1), 1 + warmth * (_CANDLE[2] - 1))
+    light = PointLight(
+        azimuth_deg=_uniform(rng, settings.azimuth_deg),
+        elevation_deg=_uniform(rng, settings.elevation_deg),
+        distance_m=_uniform(rng, settings.distance_m),
+        strength=_uniform(rng, settings.strength),
+        radius_m=_uniform(rng, settings.radius_m),
+        color=color,
+    )
+    return light, AmbientLight(_uniform(rng, settings.ambient), (1.0, 1.0, 1.0))
+
+
+def _view(settings: CameraSettings, rng: np.random.Generator) -> View:
+    radius, angle = settings.aim_offset_m * math.sqrt(rng.uniform()), rng.uniform(0, 2 * math.pi)
+    return View(
+        distance_m=_uniform(rng, settings.distance_m),
+        elevation_deg=_uniform(rng, settings.elevation_deg),
+        azimuth_deg=_uniform(rng, settings.azimuth_deg),
+        roll_deg=_uniform(rng, settings.roll_deg),
+        aim_offset_m=(radius * math.cos(angle), radius * math.sin(angle), 0.0),
+    )

@@ -1,0 +1,127 @@
+"""The recipe: files, overrides, and the one line that a wrong one is answered with."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from generator.config import Recipe, RecipeError, dump_recipe, load_recipe, settings
+
+ROOT = Path(__file__).resolve().parents[1]
+RECIPES = sorted((ROOT / "configs").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
+def test_the_recipes_of_the_project_load(path: Path) -> None:
+    recipe = load_recipe(path)
+    assert recipe.images > 0
+    assert Recipe.model_validate(json.loads(json.dumps(dump_recipe(recipe)))) == recipe
+
+
+def test_the_papers_recipe_has_the_papers_numbers() -> None:
+    recipe = load_recipe(ROOT / "configs" / "synthetless.yaml")
+    assert (recipe.images, recipe.camera.width, recipe.camera.height, recipe.camera.fx) == (30000, 400, 400, 1075)
+    assert recipe.objects.count == (1, 9)
+    assert recipe.camera.distance_m == (0.6, 1.4)
+    assert recipe.camera.elevation_deg == (10, 89)
+    assert recipe.light.elevation_deg == (30, 80)
+
+
+def test_overrides_win_over_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "recipe.yaml"
+    path.write_text("seed: 3\ncamera: {distance_m: [1, 2]}\n")
+    recipe = load_recipe(path, ["camera.distance_m=[0.5, 0.75]", "objects.ids=[1, 2]", "source.distractors=null"])
+    assert recipe.seed == 3
+    assert recipe.camera.distance_m == (0.5, 0.75)
+    assert recipe.objects.ids == (1, 2)
+
+
+def test_an_empty_file_is_the_default_recipe(tmp_path: Path) -> None:
+    path = tmp_path / "recipe.yaml"
+    path.write_text("")
+    assert load_recipe(path) == Recipe()
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("camera.distanc_m=[1, 2]", ["camera.distanc_m", "did you mean camera.distance_m"]),
+        ("distance_m=[1, 2]", ["distance_m", "did you mean camera.distance_m"]),
+        ("imges=3", ["imges", "did you mean images"]),
+        ("object.count=[1, 2]", ["did you mean objects"]),
+        ("camera.distance_m=[3, 1]", ["camera.distance_m", "min 3.0", "max 1.0"]),
+        ("camera.distance_m=[-1, 1]", ["-1.0", "0.05..20 m"]),
+        ("camera.distance_m=7", ["camera.distance_m", "[min, max]"]),
+        ("camera.distance_m=[1, .nan]", ["camera.distance_m", "finite"]),
+        ("render.samples=.inf", ["render.samples", "finite"]),
+        ("images=0", ["images", "1..100000000"]),
+        ("images=1.5", ["images", "integer"]),
+        ("camera=3", ["camera", "mapping"]),
+        ("labels.scheme=pitteri", ["labels.scheme", "pitteri2019", "atlas"]),
+        ("outputs=[rgb, dpeth]", ["outputs", "dpeth", "depth"]),
+        ("split=../else", ["split"]),
+        ("images", ["images", "key.path=value"]),
+        ("images=[", ["not valid YAML"]),
+        ("images.x=1", ["images"]),
+    ],
+)
+def test_a_wrong_override_is_told_in_one_line(override: str, expected: list[str]) -> None:
+    with pytest.raises(RecipeError) as error:
+        load_recipe(None, [override])
+    message = str(error.value)
+    assert "\n" not in message
+    for part in expected:
+        assert part in message
+
+
+@pytest.mark.parametrize("content", ["- a\n- b\n", "images: [\n", "\x00", "images: 3\nimages_: 4\n"])
+def test_a_wrong_file_is_told_in_one_line_with_its_name(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "wrong.yaml"
+    path.write_text(content)
+    with pytest.raises(RecipeError) as error:
+        load_recipe(path)
+    assert "\n" not in str(error.value)
+    assert "wrong.yaml" in str(error.value)
+
+
+def test_a_missing_file_is_told(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match="no such recipe file"):
+        load_recipe(tmp_path / "none.yaml")
+
+
+def test_every_setting_is_described_with_its_range() -> None:
+    for setting in settings():
+        assert setting.description.endswith("."), setting.key
+        assert setting.kind, setting.key
+
+
+@given(st.sampled_from([s.key for s in settings()]))
+def test_every_default_survives_being_set(key: str) -> None:
+    default = next(setting.default for setting in settings() if setting.key == key)
+    assert load_recipe(None, [f"{key}={json.dumps(default)}"]) == Recipe()
+
+
+def test_the_reference_page_is_up_to_date() -> None:
+    page = (ROOT / "docs" / "recipe.md").read_text(encoding="utf-8")
+    from generator.config import recipe_page
+
+    assert page == recipe_page(), "run `make docs`"
+
+
+def test_recipes_are_yaml_of_known_keys_only() -> None:
+    keys = {setting.key for setting in settings()}
+    for path in RECIPES:
+        for key in _leaves(yaml.safe_load(path.read_text())):
+            assert key in keys, (path.name, key)
+
+
+def _leaves(tree: dict[str, object], prefix: str = "") -> list[str]:
+    leaves = []
+    for key, value in tree.items():
+        leaves += _leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else [f"{prefix}{key}"]
+    return leaves
