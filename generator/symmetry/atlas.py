@@ -95,12 +95,7 @@ def _between_half_steps_deg(n: int, tilt_rad: float) -> float:
     return float(np.degrees(2 * np.arcsin(np.cos(tilt_rad / 2) * np.sin(np.pi / (4 * n)))))
 
 
-def separation_deg(name: GroupName, scheme: Scheme) -> float:
-    """Twice the smallest margin, at most 180: poses of one regressor that look nearer have labels as near."""
-    return min(2 * smallest_margin_deg(name, scheme), NO_JUMP_DEG)
-
-
-# T, O, I: lower bounds certified by branch and bound. D_4, D_5: what a search found. The others are exact.
+# T, O, I: lower bounds certified by branch and bound. D_4, D_5 and the paper's T: what a search found, rounded down.
 _SMALLEST_MARGIN_ATLAS_DEG: dict[Family, float] = {
     "T": 18.744,
     "O": 18.988,
@@ -109,7 +104,7 @@ _SMALLEST_MARGIN_ATLAS_DEG: dict[Family, float] = {
     "O(2)": 35.264389682754654,
 }
 _SMALLEST_MARGIN_DIHEDRAL_DEG = {2: 41.40962210927086, 4: 20.767, 5: 17.172}
-_SMALLEST_MARGIN_PITTERI2019_DEG: dict[Family, float] = {"T": 6.88}
+_SMALLEST_MARGIN_PITTERI2019_DEG: dict[Family, float] = {"T": 6.87}
 
 _POLYHEDRAL: dict[Family, list[tuple[float, float, float, float]]] = {
     "T": [

@@ -135,13 +135,20 @@ class FiniteCharts:
 
     @cached_property
     def _faces(self) -> Floats:
-        """(4, 2 (n - 1)): normals (1 - s) / |1 - s| of the Dirichlet cell around 1, s in the binary group."""
-        nontrivial = np.concatenate([self.elements_wxyz[1:], -self.elements_wxyz[1:]])
-        return normalise(np.array([1.0, 0.0, 0.0, 0.0]) - nontrivial).T
+        """(F, 4): normals (1 - s) / |1 - s| of the Dirichlet cell around 1, s in the binary group.
+
+        Only those s whose midpoint with 1 has no other member as near are neighbours; the rest cut nothing off.
+        """
+        others = np.concatenate([self.elements_wxyz[1:], -self.elements_wxyz[1:]])
+        one = np.array([1.0, 0.0, 0.0, 0.0])
+        nearness = normalise(one + others) @ others.T
+        is_neighbour = (nearness > nearness.diagonal()[:, None] - 1e-9).sum(axis=1) == 1
+        return normalise(one - others[is_neighbour])
 
     def label(self, q: Floats) -> Labels:
         """The labels of unit quaternions (N, 4)."""
-        closeness = np.abs(q @ self._targets)  # (N, K n)
+        closeness = q @ self._targets  # (N, K n)
+        np.abs(closeness, out=closeness)
         n = len(self.elements_wxyz)
         if self.rule == "margin":
             return self._widest(q, closeness.reshape(len(q), -1, n))
@@ -173,7 +180,7 @@ class FiniteCharts:
         """Sine of half the rotation angle (N,) from canonical rotations in a chart to the cell's nearest face."""
         local = multiply(conjugate(anchor), canonical)
         local *= np.where(local[:, :1] < 0, -1.0, 1.0)
-        return np.asarray((local @ self._faces).min(axis=1, initial=1.0))
+        return np.asarray((self._faces @ local.T).min(axis=0, initial=1.0))
 
     @staticmethod
     def _margin_deg(clearance: Floats) -> Floats:

@@ -16,6 +16,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from generator.symmetry.bop import recognise
+from generator.symmetry.frames import frame_of_axes, frame_of_axis, signed_axis
 from generator.symmetry.point_groups import Family, GroupName, X, Z, parse_name, standard_elements
 from generator.symmetry.quaternions import (
     IDENTITY,
@@ -29,7 +31,6 @@ from generator.symmetry.quaternions import (
     rotate,
     to_matrix,
 )
-from generator.symmetry.recognition import frame_of_axes, frame_of_axis, recognise, signed_axis
 
 Vector = tuple[float, float, float]
 

@@ -21,7 +21,7 @@ from generator.symmetry import atlas
 from generator.symmetry.atlas import SCHEMES, Scheme
 from generator.symmetry.charts import AxialCharts, Charts, FiniteCharts, Rule, SphereCharts
 from generator.symmetry.groups import SymmetryGroup
-from generator.symmetry.point_groups import parse_name
+from generator.symmetry.point_groups import Z, parse_name
 from generator.symmetry.quaternions import (
     Floats,
     conjugate,
@@ -33,8 +33,7 @@ from generator.symmetry.quaternions import (
     to_matrix,
 )
 
-_BLOCK = 8192  # poses labelled together: the intermediate arrays stay in the cache
-_RAY_AHEAD = np.array([0.0, 0.0, 1.0])
+_BLOCK = 4096  # poses labelled together: the intermediate arrays stay in the cache
 
 
 @dataclass(frozen=True)
@@ -98,6 +97,16 @@ class CanonicalMap:
         """How many regressors the object has under the scheme."""
         return len(self.anchors_wxyz)
 
+    @property
+    def smallest_margin_deg(self) -> float:
+        """The smallest margin of any pose, degrees: 0 if the scheme tears look-alikes apart, 180 if nothing jumps."""
+        return atlas.smallest_margin_deg(parse_name(self.group.name), self.scheme)
+
+    @property
+    def separation_deg(self) -> float:
+        """Twice the smallest margin, at most 180: poses of one regressor that look nearer have labels as near."""
+        return min(2 * self.smallest_margin_deg, atlas.NO_JUMP_DEG)
+
     def __call__(self, R_m2c: ArrayLike, t_m2c: ArrayLike) -> CanonicalPoses:
         """The labels of poses `R_m2c` (N, 3, 3), `t_m2c` (N, 3) mm.
 
@@ -112,7 +121,7 @@ class CanonicalMap:
         index, margin = np.empty(n, np.int64), np.empty(n)
         for block in _blocks(n):
             q = from_matrix(R[block], name=_pose_name(block.start))
-            R_c[block], t_c[block], index[block], margin[block] = self._label(q, t[block])
+            R_c[block], t_c[block], index[block], margin[block] = self._label(q, self._centres(R[block], t[block]))
         return CanonicalPoses(R_c, t_c, index, self.n_regressors, margin)
 
     def regressor_index(self, R_m2c: ArrayLike, t_m2c: ArrayLike) -> NDArray[np.int64]:
@@ -141,8 +150,7 @@ class CanonicalMap:
         The camera is turned by the smallest rotation that takes its axis to the ray to the object's fixed point.
         """
         R, t = _poses(R_m2c, t_m2c)
-        q = from_matrix(R)
-        return to_matrix(multiply(conjugate(self._ray_wxyz(q, t)), q))
+        return to_matrix(multiply(conjugate(_rays_wxyz(self._centres(R, t))), from_matrix(R)))
 
     @cached_property
     def _reference_wxyz(self) -> Floats:
@@ -159,7 +167,7 @@ class CanonicalMap:
         group = self.group
         if group.family == "SO(3)":
             return SphereCharts(self._reference_wxyz)
-        axis = rotate(group.frame_wxyz, _RAY_AHEAD)  # the standard frame's z
+        axis = rotate(group.frame_wxyz, Z)
         if not group.is_finite:
             return AxialCharts(axis, self.anchors_wxyz, group.family == "O(2)", epsilon)
         rule: Rule = "nearest"
@@ -167,28 +175,30 @@ class CanonicalMap:
             rule = "hemisphere" if group.family == "C" else "margin"
         return FiniteCharts(group.elements_wxyz, self.anchors_wxyz, rule, axis, epsilon)
 
-    def _label(self, q: Floats, t: Floats) -> tuple[Floats, Floats, NDArray[np.int64], Floats]:
+    def _label(self, q: Floats, centres: Floats) -> tuple[Floats, Floats, NDArray[np.int64], Floats]:
         if self.allocentric:
-            ray = self._ray_wxyz(q, t)
+            ray = _rays_wxyz(centres)
             seen = self._charts.label(multiply(conjugate(ray), q))
             labels = seen._replace(rotation_wxyz=multiply(ray, seen.rotation_wxyz))
         else:
             labels = self._charts.label(q)
         R_c = to_matrix(labels.rotation_wxyz)
-        offset = np.array(self.group.offset_mm)
-        t_c = t + (rotate(q, offset) - R_c @ offset) if offset.any() else t
-        return R_c, t_c, labels.chart, labels.margin_deg
+        return R_c, centres - self._centres(R_c, np.zeros(3)), labels.chart, labels.margin_deg
 
-    def _ray_wxyz(self, q: Floats, t: Floats) -> Floats:
-        """Smallest rotations (N, 4) from the camera's axis to the ray through the fixed point, the same for all S."""
-        ray = rotate(q, np.array(self.group.offset_mm)) + t
-        behind = ~(ray[:, 2] > 0)
-        if behind.any():
-            i = int(np.argmax(behind))
-            raise ValueError(
-                f"pose {i}: the object is not in front of the camera (t_m2c {t[i].tolist()} mm): no ray to it"
-            )
-        return minimal(_RAY_AHEAD, normalise(ray))
+    def _centres(self, R: Floats, t: Floats) -> Floats:
+        """Where poses (N, 3, 3), (N, 3) have the group's fixed point, (N, 3) mm: the same for all that look alike."""
+        return np.asarray(t + (R.reshape(-1, 3) @ np.array(self.group.offset_mm)).reshape(-1, 3))
+
+
+def _rays_wxyz(points_mm: Floats) -> Floats:
+    """Smallest rotations (N, 4) from the camera's axis to the rays to points (N, 3)."""
+    behind = ~(points_mm[:, 2] > 0)
+    if behind.any():
+        i = int(np.argmax(behind))
+        raise ValueError(
+            f"pose {i}: the object, at {points_mm[i].tolist()} mm, is not in front of the camera: no ray to it"
+        )
+    return minimal(Z, normalise(points_mm))
 
 
 def _poses(R_m2c: ArrayLike, t_m2c: ArrayLike) -> tuple[Floats, Floats]:

@@ -52,14 +52,20 @@ def from_axis_angle(axis: ArrayLike, angle_rad: ArrayLike) -> Floats:
 def minimal(u: Floats, v: Floats) -> Floats:
     """The smallest rotations (..., 4) taking unit vectors u to unit vectors v, both (..., 3) and not opposite."""
     u, v = np.broadcast_arrays(u, v)
-    return normalise(np.concatenate([1 + np.sum(u * v, axis=-1, keepdims=True), np.cross(u, v)], axis=-1))
+    return normalise(np.concatenate([1 + np.sum(u * v, axis=-1, keepdims=True), cross(u, v)], axis=-1))
 
 
 def rotate(q: Floats, v: Floats) -> Floats:
     """The vectors v (..., 3) turned by q (..., 4)."""
     w, xyz = q[..., :1], q[..., 1:]
-    twice = 2 * np.cross(xyz, v)
-    return v + w * twice + np.cross(xyz, twice)
+    twice = 2 * cross(xyz, v)
+    return v + w * twice + cross(xyz, twice)
+
+
+def cross(u: Floats, v: Floats) -> Floats:
+    """The cross products of (broadcastable) vectors (..., 3), several times as fast as `numpy.cross`."""
+    (ux, uy, uz), (vx, vy, vz) = (u[..., i] for i in range(3)), (v[..., i] for i in range(3))
+    return np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx], axis=-1)
 
 
 def angle_deg(p: Floats, q: Floats) -> Floats:

@@ -25,10 +25,9 @@ from typing import Any, Self
 import numpy as np
 import yaml
 
-from generator.symmetry.atlas import SCHEMES, Scheme, separation_deg
+from generator.symmetry.atlas import SCHEMES, Scheme
 from generator.symmetry.groups import SymmetryGroup
 from generator.symmetry.mapping import CanonicalMap
-from generator.symmetry.point_groups import parse_name
 
 Matrix = tuple[tuple[float, ...], ...]
 
@@ -189,7 +188,7 @@ def _derived(entry: SymmetryEntry, scheme: Scheme) -> dict[str, Any]:
         "order": int(entry.group.order) if entry.group.is_finite else "infinite",
         "n_regressors": canonical.n_regressors,
         "anchors_wxyz": canonical.anchors_wxyz.tolist(),
-        "separation_deg": separation_deg(parse_name(entry.group.name), scheme),
+        "separation_deg": canonical.separation_deg,
     }
 
 

@@ -21,7 +21,7 @@ from symmetry_cases import (
     symmetric_vertices,
 )
 
-from generator.symmetry import CanonicalMap, SymmetryGroup
+from generator.symmetry import CanonicalMap, CanonicalPoses, SymmetryGroup
 from generator.symmetry.quaternions import Floats, angle_deg, from_matrix, to_matrix
 
 N_REGRESSORS = {
@@ -34,12 +34,17 @@ def poses(R: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
     return R, rng.normal(size=(len(R), 3)) * 100 + (0, 0, 800)
 
 
-def assert_same_label(canonical: CanonicalMap, R: Floats, t: Floats, motion: Floats) -> None:
-    a, b = canonical(R, t), canonical(*moved(R, t, motion))
+def assert_same_labels(a: CanonicalPoses, b: CanonicalPoses) -> None:
     np.testing.assert_array_equal(a.regressor_index, b.regressor_index)
     np.testing.assert_allclose(a.R_m2c, b.R_m2c, atol=1e-9, rtol=0)
     np.testing.assert_allclose(a.t_m2c, b.t_m2c, atol=1e-6, rtol=0)
     np.testing.assert_allclose(a.discontinuity_margin_deg, b.discontinuity_margin_deg, atol=1e-6, rtol=0)
+
+
+def assert_unchanged(a: CanonicalPoses, b: CanonicalPoses) -> None:
+    np.testing.assert_array_equal(a.regressor_index, b.regressor_index)
+    np.testing.assert_allclose(a.R_m2c, b.R_m2c, atol=1e-12, rtol=0)
+    np.testing.assert_allclose(a.t_m2c, b.t_m2c, atol=1e-12 * 1e3, rtol=0)  # of coordinates near 1000 mm
 
 
 def assert_same_appearance(group: SymmetryGroup, R: Floats, t: Floats, R_c: Floats, t_c: Floats) -> None:
@@ -60,12 +65,9 @@ def test_random_poses_in_random_frames(name: str, scheme: str, seed: int) -> Non
     R, t = poses(random_rotations(rng, 200), rng)
     labels = canonical(R, t)
     assert_same_appearance(group, R, t, labels.R_m2c, labels.t_m2c)
-    for motion in some_motions(group, rng)[:12]:
-        assert_same_label(canonical, R, t, motion)
-    again = canonical(labels.R_m2c, labels.t_m2c)
-    np.testing.assert_array_equal(again.regressor_index, labels.regressor_index)
-    np.testing.assert_allclose(again.R_m2c, labels.R_m2c, atol=1e-12, rtol=0)
-    np.testing.assert_allclose(again.t_m2c, labels.t_m2c, atol=1e-12 * 1e3, rtol=0)
+    for motion in rng.permutation(some_motions(group, rng))[:8]:
+        assert_same_labels(labels, canonical(*moved(R, t, motion)))
+    assert_unchanged(labels, canonical(labels.R_m2c, labels.t_m2c))
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -79,10 +81,8 @@ def test_ties_of_structured_poses_are_decided_alike(name: str, scheme: str) -> N
         labels = canonical(R, t)
         assert_same_appearance(group, R, t, labels.R_m2c, labels.t_m2c)
         for motion in some_motions(group, rng):
-            assert_same_label(canonical, R, t, motion)
-        again = canonical(labels.R_m2c, labels.t_m2c)
-        np.testing.assert_array_equal(again.regressor_index, labels.regressor_index)
-        np.testing.assert_allclose(again.R_m2c, labels.R_m2c, atol=1e-12, rtol=0)
+            assert_same_labels(labels, canonical(*moved(R, t, motion)))
+        assert_unchanged(labels, canonical(labels.R_m2c, labels.t_m2c))
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -135,12 +135,11 @@ def test_a_cylinders_axis_stays_where_it_is_also_at_exact_flips(scheme: str) -> 
         across = np.linalg.svd(u[None])[2][1]
         flip = to_matrix(np.array([0.0, *across]))
         near = [flip @ to_matrix(np.array([np.cos(a), *(np.sin(a) * across)])) for a in (1e-3, 1e-7, 1e-9, 1e-16)]
-        spins = some_motions(group, rng)
         R, t = poses(np.stack([flip, *near, *random_rotations(rng, 50)]), rng)
         labels = CanonicalMap(group, scheme)(R, t)
         np.testing.assert_allclose(labels.R_m2c @ u, R @ u, atol=1e-12, rtol=0)
-        for spin in spins:
-            assert_same_label(CanonicalMap(group, scheme), R, t, spin)
+        for spin in some_motions(group, rng):
+            assert_same_labels(labels, CanonicalMap(group, scheme)(*moved(R, t, spin)))
 
 
 def test_vector_of_two_look_alikes_that_the_paper_tears_apart() -> None:
@@ -164,3 +163,134 @@ def test_vector_of_two_look_alikes_that_the_paper_tears_apart() -> None:
 def label_distance_deg(R: Floats) -> Floats:
     q = from_matrix(R)
     return angle_deg(q[:-1], q[1:])
+
+
+@pytest.mark.parametrize("decimals", [6, 9])
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("name", ["C2", "C4", "C12", "D2", "D3", "T", "O", "SO(2)", "O(2)"])
+def test_ties_outlast_the_rounding_of_a_file(name: str, scheme: str, decimals: int) -> None:
+    rng = np.random.default_rng(2)
+    group = SymmetryGroup.from_name(name)
+    canonical = CanonicalMap(group, scheme, decimals=decimals)
+    R, t = poses(np.concatenate([axis_aligned_rotations(), euler_grid(30)]), rng)
+    exact = canonical(R, t)
+    for motion in some_motions(group, rng):
+        R_moved, t_moved = moved(R, t, motion)
+        stored = canonical(R_moved.round(decimals), t_moved.round(decimals))
+        np.testing.assert_array_equal(stored.regressor_index, exact.regressor_index)
+        np.testing.assert_allclose(stored.R_m2c, exact.R_m2c, atol=10 * 10.0**-decimals)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("name", ["C3", "D3", "T", "SO(2)", "O(2)", "SO(3)"])
+def test_each_regressor_is_centred_on_its_anchor(name: str, scheme: str) -> None:
+    rng = np.random.default_rng(8)
+    reference = random_rotations(rng, 1)[0]
+    canonical = CanonicalMap(in_random_frame(name, rng), scheme, reference)
+    anchors = to_matrix(canonical.anchors_wxyz)
+    np.testing.assert_allclose(anchors[0], reference, atol=1e-12)
+    labels = canonical(anchors, np.zeros((len(anchors), 3)))
+    np.testing.assert_array_equal(labels.regressor_index, range(canonical.n_regressors))
+    np.testing.assert_allclose(labels.R_m2c, anchors, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["C1", "C2", "D3", "O", "SO(2)", "O(2)", "SO(3)"])
+def test_equivalent_poses_of_a_prediction(name: str) -> None:
+    rng = np.random.default_rng(4)
+    group = in_random_frame(name, rng)
+    canonical = CanonicalMap(group, "atlas")
+    R, t = poses(random_rotations(rng, 3), rng)
+    R_all, t_all = canonical.equivalent_poses(R, t, samples=10)
+    m = R_all.shape[1]
+    assert m == (group.order if group.is_finite else {"O(2)": 20}.get(name, 10))
+    np.testing.assert_allclose(R_all[:, 0], R, atol=1e-12)
+    np.testing.assert_allclose(t_all[:, 0], t, atol=1e-9)
+    labels = canonical(R, t)
+    for i in range(len(R)):
+        images = canonical(R_all[i], t_all[i])
+        np.testing.assert_allclose(images.R_m2c, np.tile(labels.R_m2c[i], (m, 1, 1)), atol=1e-9)
+        np.testing.assert_allclose(images.t_m2c, np.tile(labels.t_m2c[i], (m, 1)), atol=1e-6)
+    np.testing.assert_array_equal(canonical.regressor_index(R, t), labels.regressor_index)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("name", ["C1", "C2", "D3", "SO(2)", "SO(3)"])
+def test_allocentric_labels_do_not_depend_on_where_in_the_image_the_object_lies(name: str, scheme: str) -> None:
+    rng = np.random.default_rng(6)
+    group = in_random_frame(name, rng)
+    canonical = CanonicalMap(group, scheme, allocentric=True)
+    R, t = poses(random_rotations(rng, 300), rng)
+    labels = canonical(R, t)
+    assert_same_appearance(group, R, t, labels.R_m2c, labels.t_m2c)
+    for motion in some_motions(group, rng):
+        assert_same_labels(labels, canonical(*moved(R, t, motion)))
+    assert_unchanged(labels, canonical(labels.R_m2c, labels.t_m2c))
+
+    c = np.array(group.offset_mm)
+    ahead = canonical.to_allocentric(R, t)  # the same views, with the object on the camera's axis
+    on_axis = canonical(ahead, (0, 0, 700) - ahead @ c)
+    np.testing.assert_array_equal(on_axis.regressor_index, labels.regressor_index)
+    np.testing.assert_allclose(on_axis.R_m2c, canonical.to_allocentric(labels.R_m2c, labels.t_m2c), atol=1e-9)
+    np.testing.assert_allclose(on_axis.R_m2c, CanonicalMap(group, scheme)(ahead, t).R_m2c, atol=1e-9)
+    with pytest.raises(ValueError, match=r"pose 0: the object, .* is not in front of the camera"):
+        canonical(R[:1], t[:1] - (0, 0, 2000))
+
+
+def test_slightly_wrong_rotations_are_repaired() -> None:
+    rng = np.random.default_rng(9)
+    canonical = CanonicalMap(SymmetryGroup.from_name("C2"))
+    R, t = poses(random_rotations(rng, 100), rng)
+    U, _, Vt = np.linalg.svd(R + rng.normal(size=R.shape) * 1e-5)
+    labels = canonical(U @ np.diag([1 + 1e-5, 1, 1 - 2e-5]) @ Vt, t)
+    products = labels.R_m2c @ labels.R_m2c.transpose(0, 2, 1)
+    np.testing.assert_allclose(products, np.tile(np.eye(3), (100, 1, 1)), atol=1e-14)
+    np.testing.assert_allclose(labels.R_m2c, canonical(U @ Vt, t).R_m2c, atol=1e-9)
+
+
+def test_no_poses_have_no_labels() -> None:
+    labels = CanonicalMap(SymmetryGroup.from_name("C2"))(np.empty((0, 3, 3)), np.empty((0, 3)))
+    assert labels.R_m2c.shape == (0, 3, 3)
+    assert labels.regressor_index.shape == labels.discontinuity_margin_deg.shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("R", "t", "message"),
+    [
+        (np.eye(3), np.zeros(3), "not \\(N, 3, 3\\) and \\(N, 3\\)"),
+        (np.eye(3)[None], np.zeros((2, 3)), "not \\(N, 3, 3\\) and \\(N, 3\\)"),
+        (np.stack([np.eye(3), np.diag([1, 1, -1])]), np.zeros((2, 3)), "pose 1: R_m2c is no rotation: .*reflection"),
+        (np.full((1, 3, 3), np.nan), np.zeros((1, 3)), "pose 0: R_m2c is no rotation: .*not finite"),
+        (np.zeros((1, 3, 3)), np.zeros((1, 3)), "pose 0: R_m2c is no rotation"),
+        (2 * np.eye(3)[None], np.zeros((1, 3)), "not orthonormal"),
+        (np.eye(3)[None], [[0, 0, np.inf]], "pose 0: t_m2c .* not finite"),
+    ],
+)
+def test_what_is_no_pose_is_refused_in_one_line(R: Floats, t: Floats, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        CanonicalMap(SymmetryGroup.from_name("C2"))(R, t)
+    assert "\n" not in str(caught.value)
+
+
+def test_wrong_schemes_and_references_are_refused() -> None:
+    with pytest.raises(ValueError, match="unknown scheme 'paper': use one of pitteri2019, atlas"):
+        CanonicalMap(SymmetryGroup.trivial(), "paper")
+    with pytest.raises(ValueError, match=r"reference_rotation is no rotation: .*reflection"):
+        CanonicalMap(SymmetryGroup.trivial(), "atlas", -np.eye(3))
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("name", ["C2", "C6", "D2", "D3", "T", "O", "I", "O(2)"])
+def test_a_noisy_bop_entry_gives_labels_as_exact_as_any(name: str, scheme: str) -> None:
+    rng = np.random.default_rng(3)
+    fields = in_random_frame(name, rng).to_bop()
+    matrices = np.array(fields["symmetries_discrete"])
+    matrices[:, :12] += rng.normal(size=(len(matrices), 12)) * 5e-5
+    group = SymmetryGroup.from_bop(fields | {"symmetries_discrete": matrices.tolist()})
+    assert group.name == name
+    canonical = CanonicalMap(group, scheme)
+    R, t = poses(np.concatenate([axis_aligned_rotations(), random_rotations(rng, 200)]), rng)
+    labels = canonical(R, t)
+    assert_same_appearance(group, R, t, labels.R_m2c, labels.t_m2c)
+    for motion in some_motions(group, rng):
+        assert_same_labels(labels, canonical(*moved(R, t, motion)))
+    assert_unchanged(labels, canonical(labels.R_m2c, labels.t_m2c))
