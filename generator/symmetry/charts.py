@@ -108,10 +108,9 @@ class FiniteCharts:
     Attributes:
         elements_wxyz: the group (n, 4), the identity first.
         anchors_wxyz: the charts' centres (K, 4).
-        rule: how the chart is chosen. `nearest`: the chart whose anchor is nearest; `margin`: the one with the largest
-            margin;
-            `hemisphere`: the nearest of the first half of the anchors while the axis is tilted from the reference by
-            at most 90 degrees, else of the second half.
+        rule: how the chart is chosen. `nearest`: the one whose anchor is nearest. `margin`: the one with the largest
+            margin, which therefore never jumps. `hemisphere`: the nearest of the first half of the anchors while the
+            axis is tilted from the reference by at most 90 degrees, else of the second half; the margin steps there.
         axis: the main axis, for the rule `hemisphere`.
         tie_epsilon: see the module.
     """

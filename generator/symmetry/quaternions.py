@@ -6,6 +6,8 @@ q and -q are the same rotation. `multiply(p, q)` is the rotation "first q, then 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -77,7 +79,7 @@ def angle_deg(p: Floats, q: Floats) -> Floats:
 def to_matrix(q: Floats) -> Floats:
     """Rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
     products = q[..., :, None] * q[..., None, :]
-    flat = products.reshape(*q.shape[:-1], 16) @ _MATRIX_OF_PRODUCTS
+    flat = products.reshape(*q.shape[:-1], 16) @ _linear_maps().matrix_of_products
     return np.asarray(flat.reshape(*q.shape[:-1], 3, 3))
 
 
@@ -95,7 +97,7 @@ def from_matrix(R: ArrayLike, name: Callable[[int], str] = "rotation {}".format)
     """
     matrices = np.asarray(R, dtype=np.float64)
     flat = matrices.reshape(-1, 9)
-    P = (flat @ _PROJECTOR_OF_MATRIX + _PROJECTOR_CONSTANT).reshape(-1, 4, 4)
+    P = (flat @ _linear_maps().projector_of_matrix + np.eye(4).ravel() / 4).reshape(-1, 4, 4)
     best = np.argmax(P[:, range(4), range(4)], axis=1)
     start = P[np.arange(len(P)), best]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -121,21 +123,18 @@ def _what_is_wrong(matrix: Floats) -> str:
     return f"{shown} is not orthonormal with determinant 1"
 
 
-def _linear_maps() -> tuple[Floats, Floats]:
-    """The linear maps products q_i q_j (16) -> matrix (9), and matrix (9) -> 4 P - 1 (16)."""
-    to_nine = np.zeros((16, 9))
-    to_sixteen = np.zeros((9, 16))
+class _LinearMaps(NamedTuple):
+    matrix_of_products: Floats  # (16, 9): products q_i q_j -> R
+    projector_of_matrix: Floats  # (9, 16): R -> P - 1/4
+
+
+@cache
+def _linear_maps() -> _LinearMaps:
+    maps = np.zeros((4, 4, 3, 3))
     basis = np.eye(4)
-    for i in range(4):
-        for j in range(4):
-            # R(q) v = q v conj(q); its bilinear form on basis quaternions, one column v of the matrix at a time.
-            columns = [multiply(multiply(basis[i], basis[k]), conjugate(basis[j]))[1:] for k in (1, 2, 3)]
-            to_nine[4 * i + j] = np.stack(columns, axis=1).ravel()
-    symmetric = (to_nine.reshape(4, 4, 9) + to_nine.reshape(4, 4, 9).transpose(1, 0, 2)) / 2
-    to_sixteen[:] = symmetric.reshape(16, 9).T  # trace(R^T R(x)) = x^T K x, whose coefficients these are
-    return to_nine, to_sixteen
-
-
-_MATRIX_OF_PRODUCTS, _K_OF_MATRIX = _linear_maps()
-_PROJECTOR_OF_MATRIX: Floats = _K_OF_MATRIX / 4
-_PROJECTOR_CONSTANT: Floats = np.eye(4).ravel() / 4
+    for i, p in enumerate(basis):
+        for j, q in enumerate(basis):
+            maps[i, j] = multiply(multiply(p, basis[1:]), conjugate(q))[:, 1:].T  # R(q) v = q v conj(q)
+    symmetric = (maps + maps.transpose(1, 0, 2, 3)) / 2
+    # trace(R^T R(x)) is x^T K x: K's entries are sums of R's with these coefficients.
+    return _LinearMaps(maps.reshape(16, 9), symmetric.reshape(16, 9).T / 4)

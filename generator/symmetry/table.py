@@ -7,7 +7,8 @@ By hand (YAML or JSON):
     object 31: {group: D3, axis: [0, 0, 1], secondary_axis: [1, 0, 0]}
 
 As `symmetries.json` beside a dataset: {"scheme", "allocentric", "objects": {id: entry}}, where an entry also says what
-follows from the group: order, n_regressors, anchors_wxyz, separation_deg.
+follows from the group: order ("inf" for a continuous one), n_regressors, anchors (unit quaternions wxyz, in the role of
+`R_m2c`), separation_deg.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ import difflib
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -25,6 +27,7 @@ from typing import Any, Self
 import numpy as np
 import yaml
 
+from generator.formats.files import atomic_write, read_bytes
 from generator.symmetry.atlas import SCHEMES, Scheme
 from generator.symmetry.groups import SymmetryGroup
 from generator.symmetry.mapping import CanonicalMap
@@ -33,7 +36,7 @@ Matrix = tuple[tuple[float, ...], ...]
 
 _TABLE_KEYS = ("scheme", "allocentric", "objects")
 _GIVEN_KEYS = ("group", "axis", "secondary_axis", "frame", "offset", "offset_mm", "reference_rotation")
-_DERIVED_KEYS = ("order", "n_regressors", "anchors_wxyz", "separation_deg")
+_DERIVED_KEYS = ("order", "n_regressors", "anchors", "separation_deg")
 _BOP_SIZES = tuple(f"{what}_{axis}" for what in ("min", "max", "size") for axis in "xyz")
 _BOP_KEYS = ("symmetries_discrete", "symmetries_continuous", "diameter", *_BOP_SIZES)
 _OBJECT_KEY = re.compile(r"(?:object\s*|obj_?)?0*(\d+)", re.IGNORECASE)
@@ -134,22 +137,22 @@ class SymmetryTable:
             ValueError: the file cannot be read, is neither JSON nor YAML, or what `from_dict` refuses; with the file's
                 name.
         """
+        data = read_bytes(Path(path))
         try:
-            return cls.from_dict(_parsed(Path(path).read_text(encoding="utf-8")))
-        except OSError as error:
-            raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
+            return cls.from_dict(_parsed(data.decode()))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 
     def write(self, path: str | Path) -> None:
-        """Write the table as JSON (which is YAML as well), always the same bytes, whole or not at all."""
-        path = Path(path)
+        """Write the table as JSON (which is YAML as well), always the same bytes, whole or not at all.
+
+        Raises:
+            ValueError: the file cannot be written.
+        """
         head = [f'"scheme": {json.dumps(self.scheme)}', f'"allocentric": {json.dumps(self.allocentric)}']
         lines = [f"  {json.dumps(key)}: {json.dumps(entry)}" for key, entry in self.to_dict()["objects"].items()]
         text = "{\n" + ",\n".join(head) + ',\n"objects": {\n' + ",\n".join(lines) + "\n}}\n"
-        partial = path.with_name(path.name + ".part")
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
+        atomic_write(Path(path), text.encode(), durable=True)
 
     def to_dict(self) -> dict[str, Any]:
         """What `write` writes: plain dicts, lists and numbers."""
@@ -185,9 +188,9 @@ class SymmetryTable:
 def _derived(entry: SymmetryEntry, scheme: Scheme) -> dict[str, Any]:
     canonical = entry.canonical_map(scheme)
     return {
-        "order": int(entry.group.order) if entry.group.is_finite else "infinite",
+        "order": int(entry.group.order) if entry.group.is_finite else "inf",
         "n_regressors": canonical.n_regressors,
-        "anchors_wxyz": canonical.anchors_wxyz.tolist(),
+        "anchors": canonical.anchors_wxyz.tolist(),
         "separation_deg": canonical.separation_deg,
     }
 
@@ -197,7 +200,7 @@ def _entry(value: object, scheme: Scheme) -> SymmetryEntry:
         return SymmetryEntry(SymmetryGroup.from_name(value))
     if not isinstance(value, Mapping):
         raise ValueError(f"{value!r} describes no symmetries; write for example {{group: C2, axis: [0, 0, 1]}}")
-    if "group" not in value and value.keys() <= set(_BOP_KEYS):
+    if value and value.keys() <= set(_BOP_KEYS):
         return SymmetryEntry(SymmetryGroup.from_bop(value))
     _refuse_unknown(value, _GIVEN_KEYS + _DERIVED_KEYS, "it")
     if "group" not in value:
@@ -278,11 +281,29 @@ def _listed(ids: Iterable[int]) -> str:
 
 def _parsed(text: str) -> object:
     # JSON first: YAML 1.1 reads 1e-06 as a word.
+    with suppress(json.JSONDecodeError):
+        return json.loads(text, object_pairs_hook=_unique)
     try:
-        return json.loads(text)
-    except json.JSONDecodeError:
-        pass
-    try:
-        return yaml.safe_load(text)
+        return yaml.load(text, Loader=_UniqueKeyLoader)
     except yaml.YAMLError as error:
         raise ValueError(f"neither JSON nor YAML ({' '.join(str(error).split())})") from error
+
+
+def _unique(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
+    keys = [key for key, _ in pairs]
+    for key in keys:
+        if keys.count(key) > 1:
+            raise ValueError(f"{str(key)!r} is listed twice")
+    return dict(pairs)
+
+
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """YAML that refuses a key given twice, of which plain YAML silently takes the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        self.flatten_mapping(node)
+        pairs = [
+            (self.construct_object(key, deep=True), self.construct_object(value, deep=True))
+            for key, value in node.value
+        ]
+        return _unique(pairs)

@@ -71,7 +71,7 @@ def test_what_the_file_says() -> None:
     assert (entry["order"], entry["n_regressors"]) == (2, 4)
     assert entry["separation_deg"] == pytest.approx(62.8, abs=0.01)
     np.testing.assert_allclose(
-        entry["anchors_wxyz"],
+        entry["anchors"],
         [[1, 0, 0, 0], [0.5**0.5, 0, 0, 0.5**0.5], [0, 1, 0, 0], [0, 0.5**0.5, -(0.5**0.5), 0]],
         atol=1e-12,
     )
@@ -108,9 +108,13 @@ def test_tless_models_info_is_a_table_too(tless_models: Path) -> None:
         ("26: {group: C2, reference_rotation: [1, 0, 0]}", "3 rows of 3"),
         ("26: {group: D3, frame: [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}", "reflection"),
         ("26: {group: C2, order: 3}", "order does not follow"),
-        ("26: {group: C2, anchors_wxyz: [[1, 0, 0, 0]]}", "anchors_wxyz does not follow"),
+        ("26: {group: C2, anchors: [[1, 0, 0, 0]]}", "anchors does not follow"),
         ("26: {symmetries_discrete: [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1]]}", "object 26: .*reflection"),
         ("26: {group: C2}\nobject 26: {group: C3}", "object 26 is listed twice"),
+        ("26: {group: C2}\n26: {group: C3}", "'26' is listed twice"),
+        ('{"26": {"group": "C2"}, "26": {"group": "C3"}}', "'26' is listed twice"),
+        ("26: {group: C2, group: C3}", "'group' is listed twice"),
+        ("26: {}", "no group"),
         ("widget: {group: C2}", "'widget' names no object"),
         ("schema: atlas", "did you mean 'scheme'"),
         ("scheme: pitteri\nobjects: {}", "unknown scheme 'pitteri'"),
@@ -129,7 +133,7 @@ def test_wrong_tables_are_refused_in_one_line_with_the_file(tmp_path: Path, text
 
 
 def test_files_and_objects_that_are_not_there(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"none\.json: cannot be read"):
+    with pytest.raises(ValueError, match=r"none\.json: not found"):
         SymmetryTable.read(tmp_path / "none.json")
     with pytest.raises(ValueError, match="object 5 is not in the symmetry table, which has objects 26"):
         SymmetryTable({26: SymmetryEntry(SymmetryGroup.trivial())}).canonical_map(5)
