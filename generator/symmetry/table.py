@@ -290,20 +290,19 @@ def _parsed(text: str) -> object:
 
 
 def _unique(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
-    keys = [key for key, _ in pairs]
+    _refuse_repetition([key for key, _ in pairs])
+    return dict(pairs)
+
+
+def _refuse_repetition(keys: list[Any]) -> None:
     for key in keys:
         if keys.count(key) > 1:
             raise ValueError(f"{str(key)!r} is listed twice")
-    return dict(pairs)
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
     """YAML that refuses a key given twice, of which plain YAML silently takes the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        self.flatten_mapping(node)
-        pairs = [
-            (self.construct_object(key, deep=True), self.construct_object(value, deep=True))
-            for key, value in node.value
-        ]
-        return _unique(pairs)
+        _refuse_repetition([key.value for key, _ in node.value])
+        return super().construct_mapping(node, deep)

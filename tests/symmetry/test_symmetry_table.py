@@ -39,6 +39,8 @@ def test_a_table_written_by_hand(tmp_path: Path) -> None:
     assert table.entries[28].group == SymmetryGroup.trivial()
     assert table.entries[3].reference_rotation == ((0, -1, 0), (1, 0, 0), (0, 0, 1))
     np.testing.assert_allclose(np.abs(table.canonical_map(3).anchors_wxyz[0]), [0.5**0.5, 0, 0, 0.5**0.5])
+    shared = "1: &box {group: D2}\n2: {<<: *box, group: D4}"
+    assert [entry.group.name for entry in read(tmp_path, shared).entries.values()] == ["D2", "D4"]
     assert read(tmp_path, "scheme: atlas\nobjects: {1: {group: SO(2)}}").canonical_map(1).n_regressors == 2
 
 
