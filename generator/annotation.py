@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,3 +72,14 @@ class ImageAnnotation:
     instances: tuple[InstanceAnnotation, ...]
     normals: NDArray[np.float32] | None = None
     object_coordinates_mm: NDArray[np.float32] | None = None
+
+    def restricted(self, numbers: Sequence[int]) -> ImageAnnotation:
+        """The same image with only these instances, renumbered in the given order.
+
+        Args:
+            numbers: indices into ``instances``; the ones left out must fill no pixel of ``instance_ids``.
+        """
+        renumbered = np.full(len(self.instances) + 1, BACKGROUND, dtype=np.int32)  # the last entry serves BACKGROUND
+        renumbered[list(numbers)] = np.arange(len(numbers), dtype=np.int32)
+        kept = tuple(self.instances[number] for number in numbers)
+        return replace(self, instances=kept, instance_ids=renumbered[self.instance_ids])

@@ -167,7 +167,7 @@ def _configure(scene: Any, settings: RenderSettings) -> None:
     cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
     cycles.denoising_quality = "HIGH"
     cycles.denoising_prefilter = "ACCURATE" if settings.denoiser == "accurate" else "NONE"
-    scene.render.use_persistent_data = True
+    scene.render.use_persistent_data = False  # it would show the previous scene's texture again
     scene.render.image_settings.file_format = "OPEN_EXR"
     scene.render.image_settings.color_mode = "RGB"
     scene.render.image_settings.color_depth = "32"
