@@ -38,7 +38,7 @@ def modelled(part: Part) -> tuple[Surface, FloatArray]:
     shift = -box_centre(vertices) - [part.origin_x_mm, 0, 0]
     if not is_closed(raw.faces):
         raise ValueError(f"part {part.obj_id} ({part.name}) is not closed")
-    return Surface(vertices + shift, raw.faces), shift
+    return Surface(vertices + shift + 0.0, raw.faces), shift  # no negative zero
 
 
 def frame(part: Part) -> FloatArray:
@@ -69,7 +69,7 @@ def discrete_elements(part: Part, centre: FloatArray) -> FloatArray:
     turns = frame(part) @ elements @ frame(part).T
     matrices = np.tile(np.eye(4), (len(turns), 1, 1))
     matrices[:, :3, :3] = turns
-    matrices[:, :3, 3] = centre - turns @ centre
+    matrices[:, :3, 3] = np.round(centre - turns @ centre, 9)
     return matrices
 
 

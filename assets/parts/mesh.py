@@ -13,6 +13,7 @@ from scipy.spatial.distance import pdist
 from assets.parts.sectors import FloatArray, IntArray, Surface
 
 GRID_MM = 2.0**-14  # a power of two: float32 holds every coordinate, and half of one, without rounding
+NORMAL_DECIMALS = 6  # below float32's own precision: no last bit depends on the machine's order of summing
 CREASE_DEG = 30.0  # edges sharper than this stay crisp
 
 VERTEX = np.dtype([(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")])
@@ -56,8 +57,9 @@ def corner_normals(surface: Surface, crease_deg: float = CREASE_DEG) -> FloatArr
     one, other = one[alike], other[alike]
     weights = (areas[:, None] * _corner_angles(surface)).ravel()[other, None] * normals[face_of_corner[other]]
     sums = np.stack([np.bincount(one, weights[:, k], len(corners)) for k in range(3)], axis=1)
-    unit: FloatArray = (sums / np.linalg.norm(sums, axis=1, keepdims=True)).reshape(-1, 3, 3)
-    return unit
+    unit = sums / np.linalg.norm(sums, axis=1, keepdims=True)
+    rounded: FloatArray = np.round(unit, NORMAL_DECIMALS) + 0.0  # no negative zero
+    return rounded.reshape(-1, 3, 3)
 
 
 def _corner_angles(surface: Surface) -> FloatArray:
