@@ -118,11 +118,11 @@ T-LESS: An RGB-D Dataset for 6D Pose Estimation of Texture-less Objects
 T. Hodan, P. Haluza, S. Obdrzalek, J. Matas, M. Lourakis, X. Zabulis, WACV 2017
 https://cmp.felk.cvut.cz/t-less, in the format of BOP: https://bop.felk.cvut.cz
 
-Licence: Creative Commons Attribution 4.0 International (CC BY 4.0) according to BOP's
-archive, https://creativecommons.org/licenses/by/4.0/. The T-LESS toolkit of the same
-authors names Attribution-ShareAlike 4.0 (CC BY-SA 4.0) instead,
-https://creativecommons.org/licenses/by-sa/4.0/: who passes the models or images of them
-on is safe with the latter. Name the authors either way.
+Licence: BOP publishes it on Hugging Face under Creative Commons Attribution 4.0
+(CC BY 4.0, https://creativecommons.org/licenses/by/4.0/). The authors' T-LESS
+toolkit names Attribution-ShareAlike 4.0 for it instead (CC BY-SA 4.0,
+https://creativecommons.org/licenses/by-sa/4.0/). Whoever passes on the models,
+or images of them, respects both by keeping to the latter.
 """,
 )
 
@@ -140,12 +140,13 @@ DTD = DataSource(
     check=check_dtd,
     licence="""\
 Describable Textures Dataset (DTD), release 1.0.1
-M. Cimpoi, S. Maji, I. Kokkinos, S. Mohamed, A. Vedaldi: Describing Textures in the Wild,
-CVPR 2014, https://www.robots.ox.ac.uk/~vgg/data/dtd/
+M. Cimpoi, S. Maji, I. Kokkinos, S. Mohamed, A. Vedaldi:
+Describing Textures in the Wild, CVPR 2014
+https://www.robots.ox.ac.uk/~vgg/data/dtd/
 
-Licence: made available to the computer vision community for research purposes. The
-images were collected from the web and belong to their photographers; for other
-purposes take textures whose licence allows it, such as CC0 ones.
+Licence: made available to the computer vision community for research purposes.
+The images were collected from the web and belong to their photographers; for
+other purposes take textures whose licence allows it, such as CC0 ones.
 """,
 )
 
