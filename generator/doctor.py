@@ -72,12 +72,11 @@ def examine(folder: Path = Path()) -> tuple[Check, ...]:
     Args:
         folder: where datasets are to be made; it need not exist.
     """
-    library = machine.blender_library()
     place = machine.nearest_existing(folder)
     return (
         check_python(sys.version_info[:3]),
         check_blender(machine.blender_version()),
-        check_libraries(machine.unresolved(library) if library else (), machine.unloadable(LOADED_LATER)),
+        check_libraries(missing_libraries(machine.blender_library()), machine.unloadable(LOADED_LATER)),
         check_devices(machine.ask(machine.probe("devices"))),
         check_cores(len(os.sched_getaffinity(0)), machine.core_quota()),
         check_memory(machine.available_memory_bytes()),
@@ -85,6 +84,14 @@ def examine(folder: Path = Path()) -> tuple[Check, ...]:
         check_writable(place),
         check_render(machine.ask(machine.probe("render"))),
     )
+
+
+def missing_libraries(blender: Path | None) -> tuple[str, ...]:
+    """What Blender is linked with and the system lacks; without Blender or ldd, what it is known to need."""
+    unresolved = machine.unresolved(blender) if blender else None
+    if unresolved is not None:
+        return unresolved
+    return machine.unloadable(name for name in PACKAGES if name not in LOADED_LATER)
 
 
 def is_fit(checks: Iterable[Check]) -> bool:
@@ -137,23 +144,14 @@ def check_blender(version: str | None) -> Check:
     return Check("Blender", "ok", f"bpy {version}")
 
 
-def check_libraries(missing: Sequence[str] | None, missing_later: Sequence[str] = ()) -> Check:
-    """Judge the shared libraries that the system lacks.
-
-    Args:
-        missing: Blender is linked with these; None if that could not be found out.
-        missing_later: these it may look for while it runs.
-    """
+def check_libraries(missing: Sequence[str], missing_later: Sequence[str] = ()) -> Check:
+    """Judge the shared libraries that the system lacks: those needed to start, and those Blender may look for later."""
     if missing:
         return Check("libraries", "fail", f"missing {', '.join(missing)}", _packages([*missing, *missing_later]))
     if missing_later:
         value = f"missing {', '.join(missing_later)}; rendering does without as a rule"
         return Check("libraries", "warn", value, _packages(missing_later))
-    if missing is None:
-        return Check(
-            "libraries", "warn", "not looked at: ldd does not work here", "see whether the test render succeeds"
-        )
-    return Check("libraries", "ok", "all that Blender is linked with are there")
+    return Check("libraries", "ok", "all that Blender needs are there")
 
 
 def _packages(libraries: Sequence[str]) -> str:
