@@ -1,0 +1,152 @@
+"""The command line. Thin: each command reads its arguments, calls one function and prints what it returns."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from generator.config import load_recipe, settings
+from generator.doctor import examine, is_fit, to_json, to_text
+from generator.fetch import fetch
+from generator.formats.files import atomic_write
+from generator.formats.images import encode_png
+from generator.generate import Execution, Summary, generate
+from generator.replay import render_again
+from generator.review.sheet import write_contact_sheet
+from scenes.blender import BlenderError
+
+SHEET_FILE = "preview.jpg"
+EXIT_FAILED, EXIT_WRONG_REQUEST, EXIT_INTERRUPTED = 1, 2, 130
+
+app = typer.Typer(
+    help="Synthetic 6D pose datasets of symmetric, texture-less parts, with labels a network can learn.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+
+def main() -> None:
+    """Entry point: a wrong request becomes one line on stderr and exit code 2."""
+    try:
+        app()
+    except (ValueError, BlenderError) as error:
+        _quit(str(error), EXIT_WRONG_REQUEST)
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        _quit(f"{place}{error.strerror or error}", EXIT_WRONG_REQUEST)
+    except KeyboardInterrupt:
+        _quit("interrupted", EXIT_INTERRUPTED)
+
+
+def _quit(message: str, code: int) -> None:
+    print(f"synthetless: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(code)
+
+
+def _settings_help() -> str:
+    lines = [f"{s.key}={json.dumps(s.default)}  {s.description}" for s in settings()]
+    return "Settings of a recipe, for --set:\n\n" + "\n\n".join(lines)
+
+
+@app.command("generate", epilog=_settings_help())
+def generate_command(
+    recipe: Annotated[Path, typer.Argument(help="The recipe, a YAML file.")],
+    out: Annotated[Path, typer.Option(help="Folder of the dataset. Run again to go on with it.")],
+    images: Annotated[int | None, typer.Option(help="How many images; more than before extends the dataset.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Everything random follows from it.")] = None,
+    models: Annotated[str | None, typer.Option(help="BOP models folder, or builtin.")] = None,
+    textures: Annotated[str | None, typer.Option(help="Folder of photographs, or builtin.")] = None,
+    overrides: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a setting.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores if not given.")] = None,
+    threads: Annotated[int, typer.Option(min=0, help="Threads of each process; 0 uses every core.")] = 1,
+    drop_limit: Annotated[float, typer.Option(min=1, help="Seconds after which a drop is given up.")] = 1800,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+) -> None:
+    """Make a dataset: drop, render, measure, label, write."""
+    given: list[tuple[str, Any]] = [
+        ("images", images),
+        ("seed", seed),
+        ("source.models", models),
+        ("source.textures", textures),
+    ]
+    direct = [f"{key}={json.dumps(value)}" for key, value in given if value is not None]
+    resolved = load_recipe(recipe, [*(overrides or []), *direct])
+    execution = Execution(workers or len(os.sched_getaffinity(0)), threads, drop_limit)
+    summary = generate(resolved, out, execution)
+    sheet = None
+    if "rgb" in resolved.outputs and summary.images:
+        sheet = out / SHEET_FILE
+        write_contact_sheet(out, sheet, resolved.split)
+    _report(summary, out, sheet, as_json)
+    if summary.failures:
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _report(summary: Summary, out: Path, sheet: Path | None, as_json: bool) -> None:
+    if as_json:
+        answer = {
+            "images": summary.images,
+            "instances": summary.instances,
+            "made": summary.made,
+            "mean_visib_fract": summary.mean_visib_fract,
+            "failures": summary.failures,
+            "dataset": str(out),
+        }
+        print(json.dumps(answer))
+        return
+    print(
+        f"{summary.images} images ({summary.made} new), {summary.instances} instances, "
+        f"{summary.mean_visib_fract:.0%} visible on average, {len(summary.failures)} failed drops"
+    )
+    for failure in summary.failures:
+        print(f"  {failure}")
+    print(f"dataset: {out}")
+    if sheet:
+        print(f"picture: {sheet}")
+
+
+@app.command("render")
+def render_command(
+    dataset: Annotated[Path, typer.Argument(help="The dataset's folder.")],
+    scene: Annotated[int, typer.Argument(help="Number of the scene folder.")],
+    image: Annotated[int, typer.Argument(help="Image id in it.")],
+    to: Annotated[Path, typer.Option(help="PNG file to write.")],
+    textures: Annotated[Path | None, typer.Option(help="Folder of the photographs, if it has moved.")] = None,
+) -> None:
+    """Render one recorded image again."""
+    atomic_write(to, encode_png(render_again(dataset, scene, image, textures)))
+    print(to)
+
+
+@app.command("doctor")
+def doctor_command(
+    out: Annotated[Path, typer.Option(help="Where datasets are to be made.")] = Path(),
+    as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
+) -> None:
+    """Look whether this machine can make datasets, and say what to do where it cannot."""
+    checks = examine(out)
+    print(to_json(checks) if as_json else to_text(checks))
+    if not is_fit(checks):
+        raise typer.Exit(EXIT_FAILED)
+
+
+@app.command("fetch")
+def fetch_command(
+    what: Annotated[Literal["tless", "dtd"], typer.Argument(help="T-LESS CAD models, or Describable Textures.")],
+    to: Annotated[Path, typer.Option(help="Folder to put them into.")],
+    source: Annotated[str | None, typer.Option("--from", help="Archive, folder or address to take them from.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> None:
+    """Get public data: from where it is published, checked, with its licence."""
+    report = fetch(what, to, source)
+    if as_json:
+        print(json.dumps(asdict(report), default=str))
+    else:
+        print(f"{report}\n\n{report.licence}\nlicence: {report.licence_file}")
