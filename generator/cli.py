@@ -7,7 +7,7 @@ import os
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NoReturn
 
 import typer
 
@@ -41,11 +41,9 @@ def main() -> None:
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         _quit(f"{place}{error.strerror or error}", EXIT_WRONG_REQUEST)
-    except KeyboardInterrupt:
-        _quit("interrupted", EXIT_INTERRUPTED)
 
 
-def _quit(message: str, code: int) -> None:
+def _quit(message: str, code: int) -> NoReturn:
     print(f"synthetless: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(code)
 
@@ -79,7 +77,10 @@ def generate_command(
     direct = [f"{key}={json.dumps(value)}" for key, value in given if value is not None]
     resolved = load_recipe(recipe, [*(overrides or []), *direct])
     execution = Execution(workers or len(os.sched_getaffinity(0)), threads, drop_limit)
-    summary = generate(resolved, out, execution)
+    try:
+        summary = generate(resolved, out, execution)
+    except KeyboardInterrupt:  # here, since typer would end without a word
+        _quit("interrupted; run the same command again to go on", EXIT_INTERRUPTED)
     sheet = None
     if "rgb" in resolved.outputs and summary.images:
         sheet = out / SHEET_FILE
