@@ -8,13 +8,15 @@ them, at any time and as often as one likes.
 from __future__ import annotations
 
 import fcntl
+import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from generator.changes import complete
 from generator.config import Recipe, dump_recipe
 from generator.formats import bop
 from generator.formats.bop import Entry, ScenePaths
@@ -28,7 +30,7 @@ DATASET_FILE = "dataset.json"
 SYMMETRIES_FILE = "symmetries.json"
 MODELS_FOLDER = "models"
 RECORDS_FOLDER = ".records"
-_LOCK_FILE = ".lock"
+_LOCK_FILE = ".synthetless.lock"
 _MAY_CHANGE = ("images", "name", "source")
 """Settings that a dataset may be continued under another value of: the sources are compared by their content."""
 
@@ -84,21 +86,9 @@ class Dataset:
         dataset._write_companions(models)
         return dataset
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Keep every other generator out of the folder for the duration.
-
-        Raises:
-            DatasetError: another one is at work in it.
-        """
-        with (self.root / _LOCK_FILE).open("w") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                raise DatasetError(
-                    f"{self.root}: another synthetless is writing here; let it finish, or stop it"
-                ) from None
-            yield
+    def locked(self) -> AbstractContextManager[None]:
+        """Keep every other writer out of the folder for the duration; errors as in ``locked``."""
+        return locked(self.root)
 
     def scene(self, scene_id: int) -> ScenePaths:
         """The files of a scene folder."""
@@ -133,24 +123,32 @@ class Dataset:
         Raises:
             ValueError: a file cannot be read or written.
         """
+        complete(self.root)
         table = SymmetryTable.read(self.root / SYMMETRIES_FILE)
+        header = read_json(self.root / DATASET_FILE)
+        symmetries = describe_symmetries(table)
+        stale = header.get("symmetries") != symmetries
         infos = {int(key): info for key, info in read_json(self.root / MODELS_FOLDER / INFO_FILE).items()}
         images = instances = 0
         for folder in sorted((self.root / RECORDS_FOLDER).glob("*")):
-            gt = self._assemble_scene(int(folder.name), table, infos)
+            gt = self._assemble_scene(int(folder.name), table, infos, stale)
             images += len(gt)
             instances += sum(len(entries) for entries in gt.values())
-        header = read_json(self.root / DATASET_FILE)
         header["recipe"] = dump_recipe(self.recipe)
         header["counts"] = {"images": images, "instances": instances}
-        header["symmetries"] = {"scheme": table.scheme, "sha256": table.digest()}
+        header["symmetries"] = symmetries
         write_json(self.root / DATASET_FILE, header)
 
     def _records(self, scene_id: int) -> Path:
         return self.root / RECORDS_FOLDER / f"{scene_id:06d}"
 
-    def _assemble_scene(self, scene_id: int, table: SymmetryTable, infos: Mapping[int, Entry]) -> dict[int, Any]:
-        """Write the JSON files of a scene folder, unless they tell of every record already; return scene_gt."""
+    def _assemble_scene(
+        self, scene_id: int, table: SymmetryTable, infos: Mapping[int, Entry], stale: bool
+    ) -> dict[int, Any]:
+        """Write the JSON files of a scene folder, unless they tell of every record already; return scene_gt.
+
+        ``stale`` tells that the folder's labels may be of other symmetries than the table's.
+        """
         scene = self.scene(scene_id)
         paths = {int(path.stem): path for path in sorted(self._records(scene_id).glob("*.json"))}
         if scene.scene_camera.exists():
@@ -160,7 +158,7 @@ class Dataset:
                     f"{self._records(scene_id)}: lacks the records of {len(listed - paths.keys())} images; "
                     "without them the dataset cannot be continued"
                 )
-            if listed == paths.keys():
+            if listed == paths.keys() and not stale:
                 return bop.read_scene_json(scene.scene_gt)
         records = {im_id: read_json(path) for im_id, path in paths.items()}
         camera = {im_id: record["camera"] for im_id, record in records.items()}
@@ -195,6 +193,37 @@ class Dataset:
                 write_json(path, content)
         if not (self.root / SYMMETRIES_FILE).exists():
             SymmetryTable.from_models_info(infos, self.recipe.labels.scheme).write(self.root / SYMMETRIES_FILE)
+
+
+@contextmanager
+def locked(root: Path) -> Iterator[None]:
+    """Keep every other writer out of a dataset's folder for the duration; nothing of the lock remains.
+
+    Raises:
+        DatasetError: another one is at work in it, or it cannot be written.
+    """
+    path = root / _LOCK_FILE
+    busy = DatasetError(f"{root}: another synthetless is writing here; let it finish, or stop it")
+    try:
+        lock = path.open("a")
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be written ({error.strerror})") from None
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not os.path.samestat(path.stat(), os.fstat(lock.fileno())):  # its former holder has just taken it away
+                raise busy
+        except OSError:
+            raise busy from None
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+
+
+def describe_symmetries(table: SymmetryTable) -> Entry:
+    """What dataset.json says of the symmetries that the labels were made with."""
+    return {"scheme": table.scheme, "sha256": table.digest()}
 
 
 def _header(recipe: Recipe, models: Mapping[int, ObjectModel], photos_digest: str) -> Entry:

@@ -75,8 +75,17 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     Raises:
         ValueError: a number is not finite, or the file cannot be written.
     """
+    atomic_write(path, json_bytes(path, content), durable=True)
+
+
+def json_bytes(path: Path, content: Mapping[str, Any]) -> bytes:
+    """What ``write_json`` writes to ``path``, which here only tells where a number is not finite.
+
+    Raises:
+        ValueError: a number is not finite.
+    """
     lines = (f"  {json.dumps(key)}: {_line(path, value)}" for key, value in content.items())
-    atomic_write(path, ("{\n" + ",\n".join(lines) + "\n}\n").encode(), durable=True)
+    return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
 
 
 def read_json(path: Path) -> dict[str, Any]:
