@@ -39,6 +39,12 @@ class Adoption:
     instances: int
     written: int
 
+    def __str__(self) -> str:
+        return (
+            f"{self.instances} instances in {self.images} images of {', '.join(self.splits)}, scheme "
+            f"{self.table.scheme}, models of {self.models}; {self.written} of {self.scenes} scene folders changed"
+        )
+
 
 def adopt(
     root: Path,

@@ -40,6 +40,14 @@ class ObjectChange:
     n_regressors_after: int
     tally: Tally
 
+    def __str__(self) -> str:
+        return (
+            f"object {self.obj_id}: {_arrow(self.group_before, self.group_after)}, "
+            f"regressors {_arrow(self.n_regressors_before, self.n_regressors_after)}; "
+            f"{self.tally.changed} of {self.tally.instances} instances change, "
+            f"{self.tally.index_changed} their regressor, by {self.tally.max_rotation_deg:.1f} degrees at most"
+        )
+
 
 @dataclass(frozen=True)
 class Relabelling:
@@ -56,6 +64,10 @@ class Relabelling:
     scenes: int
     images: int
     objects: tuple[ObjectChange, ...]
+
+    def __str__(self) -> str:
+        head = f"scheme {_arrow(self.scheme_before, self.scheme_after)}, {self.images} images"
+        return "\n".join([head, *map(str, self.objects)])
 
 
 def relabel(
@@ -133,6 +145,10 @@ def revised(
         scheme or (other if "scheme" in stated else table).scheme,
         (other if "allocentric" in stated else table).allocentric,
     )
+
+
+def _arrow(before: object, after: object) -> str:
+    return f"{before}" if before == after else f"{before} -> {after}"
 
 
 def _keys(path: Path) -> set[str]:

@@ -55,6 +55,7 @@ def test_labels_lie_beside_files_that_stay_as_they_are(bop: Path) -> None:
     assert {name: after[name] for name in before} == before
     assert adoption.models == bop / "models_cad"
     assert adoption.splits == ("test_primesense", "train_pbr", "train_primesense")
+    assert str(adoption).startswith("80 instances in 20 images of test_primesense, train_pbr, train_primesense, scheme")
     assert (adoption.scenes, adoption.images, adoption.instances, adoption.written) == (5, 20, 2 * 4 + 3 * 4 * 6, 5)
 
 

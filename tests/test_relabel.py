@@ -183,6 +183,7 @@ def test_a_dry_run_tells_what_then_happens(root: Path, tmp_path: Path) -> None:
     assert none.tally.index_changed == sum(old["regressor_index"] for old, _ in changes) > 0
     assert none.tally.max_rotation_deg == pytest.approx(180), "C2 turns by half turns"
     assert half.tally.max_rotation_deg in (pytest.approx(90), pytest.approx(180))
+    assert f"object 25: C2 -> C1, regressors 2 -> 1; {len(changes)} of {len(changes)} instances change" in str(told)
     again = relabel(root, table, dry_run=True, workers=1)
     assert again.objects == (), "nothing is left to do"
 
