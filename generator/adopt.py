@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from generator.changes import changes, complete
-from generator.dataset import DATASET_FILE, SYMMETRIES_FILE, locked
+from generator.dataset import DATASET_FILE, SYMMETRIES_FILE
 from generator.formats.bop import ScenePaths
 from generator.formats.files import read_json
 from generator.labelling import LabelledScene, label_folders, laid_out, scene_folders
+from generator.locks import locked
 from generator.models import INFO_FILE, read_models_info
 from generator.relabel import revised
 from generator.symmetry import SymmetryTable

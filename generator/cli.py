@@ -17,6 +17,7 @@ from generator.fetch import fetch
 from generator.formats.files import atomic_write
 from generator.formats.images import encode_png
 from generator.generate import Execution, Summary, generate
+from generator.plan import Part
 from generator.replay import render_again
 from generator.review.sheet import write_contact_sheet
 from scenes.blender import BlenderError
@@ -65,6 +66,9 @@ def generate_command(
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores if not given.")] = None,
     threads: Annotated[int, typer.Option(min=0, help="Threads of each process; 0 uses every core.")] = 1,
     drop_limit: Annotated[float, typer.Option(min=1, help="Seconds after which a drop is given up.")] = 1800,
+    part: Annotated[
+        str | None, typer.Option(metavar="K/N", help="Make only every N-th drop; others do the rest.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Make a dataset: drop, render, measure, label, write."""
@@ -76,7 +80,9 @@ def generate_command(
     ]
     direct = [f"{key}={json.dumps(value)}" for key, value in given if value is not None]
     resolved = load_recipe(recipe, [*(overrides or []), *direct])
-    execution = Execution(workers or len(os.sched_getaffinity(0)), threads, drop_limit)
+    execution = Execution(
+        workers or len(os.sched_getaffinity(0)), threads, drop_limit, Part.parse(part) if part else None
+    )
     try:
         summary = generate(resolved, out, execution)
     except KeyboardInterrupt:  # here, since typer would end without a word

@@ -7,10 +7,7 @@ them, at any time and as often as one likes.
 
 from __future__ import annotations
 
-import fcntl
-import os
-from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -22,6 +19,7 @@ from generator.formats import bop
 from generator.formats.bop import Entry, ScenePaths
 from generator.formats.files import atomic_write, read_json, write_json, write_json_lines
 from generator.labels import label_scene
+from generator.locks import in_turn
 from generator.models import INFO_FILE, ObjectModel
 from generator.plan import ImagePlan, image_number
 from generator.symmetry import SymmetryTable
@@ -30,7 +28,6 @@ DATASET_FILE = "dataset.json"
 SYMMETRIES_FILE = "symmetries.json"
 MODELS_FOLDER = "models"
 RECORDS_FOLDER = ".records"
-_LOCK_FILE = ".synthetless.lock"
 _MAY_CHANGE = ("images", "name", "source")
 """Settings that a dataset may be continued under another value of: the sources are compared by their content."""
 
@@ -86,10 +83,6 @@ class Dataset:
         dataset._write_companions(models)
         return dataset
 
-    def locked(self) -> AbstractContextManager[None]:
-        """Keep every other writer out of the folder for the duration; errors as in ``locked``."""
-        return locked(self.root)
-
     def scene(self, scene_id: int) -> ScenePaths:
         """The files of a scene folder."""
         return ScenePaths.of(self.root, scene_id, self.recipe.split)
@@ -123,6 +116,10 @@ class Dataset:
         Raises:
             ValueError: a file cannot be read or written.
         """
+        with in_turn(self.root):
+            self._assemble()
+
+    def _assemble(self) -> None:
         complete(self.root)
         table = SymmetryTable.read(self.root / SYMMETRIES_FILE)
         header = read_json(self.root / DATASET_FILE)
@@ -195,32 +192,6 @@ class Dataset:
             SymmetryTable.from_models_info(infos, self.recipe.labels.scheme).write(self.root / SYMMETRIES_FILE)
 
 
-@contextmanager
-def locked(root: Path) -> Iterator[None]:
-    """Keep every other writer out of a dataset's folder for the duration; nothing of the lock remains.
-
-    Raises:
-        DatasetError: another one is at work in it, or it cannot be written.
-    """
-    path = root / _LOCK_FILE
-    busy = DatasetError(f"{root}: another synthetless is writing here; let it finish, or stop it")
-    try:
-        lock = path.open("a")
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be written ({error.strerror})") from None
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if not os.path.samestat(path.stat(), os.fstat(lock.fileno())):  # its former holder has just taken it away
-                raise busy
-        except OSError:
-            raise busy from None
-        try:
-            yield
-        finally:
-            path.unlink(missing_ok=True)
-
-
 def describe_symmetries(table: SymmetryTable) -> Entry:
     """What dataset.json says of the symmetries that the labels were made with."""
     return {"scheme": table.scheme, "sha256": table.digest()}
@@ -242,7 +213,7 @@ def _header(recipe: Recipe, models: Mapping[int, ObjectModel], photos_digest: st
 def _refuse_foreign(root: Path) -> None:
     try:
         root.mkdir(parents=True, exist_ok=True)
-        strangers = sorted(path.name for path in root.iterdir())
+        strangers = sorted(path.name for path in root.iterdir() if not path.name.startswith("."))
     except OSError as error:
         raise DatasetError(f"{root}: cannot be used as output folder ({error.strerror})") from None
     if strangers:

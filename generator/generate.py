@@ -10,7 +10,8 @@ from tqdm import tqdm
 from generator.config import Recipe
 from generator.dataset import DATASET_FILE, Dataset
 from generator.formats import bop
-from generator.plan import by_drop
+from generator.locks import locked
+from generator.plan import Part, by_drop, plan_image
 from generator.sources import check_photos, load_sources
 from generator.workers import Job, Outcome, Workplace, run
 
@@ -43,11 +44,13 @@ class Execution:
         workers: processes that make drops side by side.
         threads: of the renderer in each of them; 0 uses every core.
         drop_limit_s: a drop that takes longer is given up.
+        part: the share of the drops to make; None for all of them. Other machines may make the others meanwhile.
     """
 
     workers: int = 1
     threads: int = 1
     drop_limit_s: float = 1800.0
+    part: Part | None = None
 
 
 def generate(recipe: Recipe, out: Path, execution: Execution) -> Summary:
@@ -66,24 +69,29 @@ def generate(recipe: Recipe, out: Path, execution: Execution) -> Summary:
     if not (out / DATASET_FILE).exists():
         check_photos(sources)
     dataset = Dataset.open(out, recipe, sources.models, sources.photos_digest)
-    with dataset.locked():
-        missing = dataset.missing()
+    with locked(out, execution.part):
+        missing = _wanted(dataset, execution.part)
         failures: list[Outcome] = []
         try:
             if missing:
                 failures = _make(dataset, missing, execution)
         finally:  # an interrupted dataset can be looked at, too
             dataset.assemble()
-    return _summarise(dataset, len(missing) - len(dataset.missing()), failures)
+    return _summarise(dataset, len(missing) - len(_wanted(dataset, execution.part)), failures)
+
+
+def _wanted(dataset: Dataset, part: Part | None) -> list[int]:
+    """Numbers of the images that do not exist yet and are this run's to make."""
+    views = dataset.recipe.camera.views_per_drop
+    return [number for number in dataset.missing() if part is None or part.takes(plan_image(number, views).drop)]
 
 
 def _make(dataset: Dataset, missing: list[int], execution: Execution) -> list[Outcome]:
     """Make the missing images; return the drops that failed, in their order."""
     failures: list[Outcome] = []
-    total = dataset.recipe.images
     jobs = [Job(drop, tuple(images)) for drop, images in by_drop(missing, dataset.recipe.camera.views_per_drop)]
     place = Workplace(dataset.recipe, dataset.root, execution.threads, execution.drop_limit_s)
-    with tqdm(total=total, initial=total - len(missing), unit="image", mininterval=0.5, smoothing=0.05) as bar:
+    with tqdm(total=len(missing), unit="image", mininterval=0.5, smoothing=0.05) as bar:
         for count, outcome in enumerate(run(jobs, place, min(execution.workers, len(jobs))), start=1):
             bar.update(outcome.made)
             if outcome.failure:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import groupby
@@ -19,6 +20,31 @@ class ImagePlan:
     view: int
     scene_id: int
     im_id: int
+
+
+@dataclass(frozen=True)
+class Part:
+    """A share of a dataset's drops: every ``count``-th, beginning with the ``number``-th, counted from 1."""
+
+    number: int
+    count: int
+
+    @classmethod
+    def parse(cls, text: str) -> Part:
+        """Read "3/10".
+
+        Raises:
+            ValueError: it is written otherwise, or not one of the parts.
+        """
+        match = re.fullmatch(r"(\d+)/(\d+)", text)
+        part = cls(*map(int, match.groups())) if match else None
+        if part is None or not 1 <= part.number <= part.count:
+            raise ValueError(f"part {text!r}: write it as 3/10, from 1/10 to 10/10")
+        return part
+
+    def takes(self, drop: int) -> bool:
+        """Whether a drop belongs to this part."""
+        return drop % self.count == self.number - 1
 
 
 def plan_image(number: int, views_per_drop: int) -> ImagePlan:

@@ -12,9 +12,10 @@ from pathlib import Path
 import yaml
 
 from generator.changes import changes, complete, refuse_half_changed
-from generator.dataset import DATASET_FILE, MODELS_FOLDER, SYMMETRIES_FILE, describe_symmetries, locked
+from generator.dataset import DATASET_FILE, MODELS_FOLDER, SYMMETRIES_FILE, describe_symmetries
 from generator.formats.files import read_bytes, read_json, write_json
 from generator.labelling import LabelledScene, Tally, label_folders, laid_out, scene_folders
+from generator.locks import locked
 from generator.models import read_models_info
 from generator.symmetry import SymmetryTable
 from generator.symmetry.atlas import Scheme

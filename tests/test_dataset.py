@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,9 @@ from generator.config import Recipe, load_recipe
 from generator.dataset import Dataset, DatasetError, FinishedImage
 from generator.formats import bop, images
 from generator.formats.files import read_json
+from generator.locks import LockedError, in_turn, locked
 from generator.models import ObjectModel, load_models
-from generator.plan import by_drop, image_number, plan_image
+from generator.plan import Part, by_drop, image_number, plan_image
 from generator.symmetry import SymmetryTable
 
 
@@ -60,7 +62,7 @@ def _tree(root: Path) -> dict[str, bytes]:
     return {
         str(path.relative_to(root)): path.read_bytes()
         for path in sorted(root.rglob("*"))
-        if path.is_file() and path.name != ".lock"
+        if path.is_file() and not path.name.endswith(".lock")
     }
 
 
@@ -173,12 +175,33 @@ def test_a_foreign_folder_is_left_alone(tmp_path: Path, recipe: Recipe, models: 
         Dataset.open(foreign / "thesis.tex" / "d", recipe, models, "")
 
 
-def test_two_generators_in_one_folder_are_told(tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel]) -> None:
-    dataset = Dataset.open(tmp_path / "d", recipe, models, "")
-    with dataset.locked(), pytest.raises(DatasetError, match="another synthetless"), dataset.locked():
+def test_two_generators_in_one_folder_are_told(tmp_path: Path) -> None:
+    for _ in range(2):
+        with locked(tmp_path), pytest.raises(LockedError, match="another synthetless"), locked(tmp_path):
+            pass
+    assert not list(tmp_path.iterdir()), "nothing of the lock remains"
+
+
+def test_parts_work_side_by_side_and_the_same_part_does_not(tmp_path: Path) -> None:
+    with locked(tmp_path, Part(1, 3)), locked(tmp_path, Part(2, 3)):
+        for part in (Part(1, 3), None):
+            with pytest.raises(LockedError, match="another synthetless"), locked(tmp_path, part):
+                pass
+        with in_turn(tmp_path):
+            pass
+    with locked(tmp_path), pytest.raises(LockedError), locked(tmp_path, Part(3, 3)):
         pass
-    with dataset.locked():
-        pass
+
+
+@pytest.mark.parametrize("text", ["0/3", "4/3", "3", "a/b", "1/0", "-1/2", "1/2/3"])
+def test_a_wrong_part_is_told(text: str) -> None:
+    with pytest.raises(ValueError, match="write it as 3/10"):
+        Part.parse(text)
+
+
+def test_parts_share_every_drop_once() -> None:
+    for drop in range(50):
+        assert sum(Part(k, 7).takes(drop) for k in range(1, 8)) == 1
 
 
 def test_lost_records_are_told(tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel]) -> None:
@@ -199,7 +222,7 @@ def test_a_full_disk_leaves_no_image_behind(
     rgb.mkdir(parents=True)
     image = _image(0)
     monkeypatch.setattr("os.getpid", lambda: "full")
-    (rgb / f".{plan_image(0, 1).im_id:06d}.png.full.part").symlink_to("/dev/full")
+    (rgb / f".{plan_image(0, 1).im_id:06d}.png.{socket.gethostname()}.full.part").symlink_to("/dev/full")
     with pytest.raises(DatasetError, match="No space left on device"):
         dataset.commit(image)
     assert 0 in dataset.missing()

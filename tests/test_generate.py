@@ -34,7 +34,7 @@ objects: {count: [2, 4]}
 render: {samples: 2}
 outputs: [rgb, depth, masks, normals, object_coordinates, exr]
 """
-NOT_DATA = {".lock", ".logs"}
+NOT_DATA = {".synthetless.lock", ".logs"}
 
 
 @pytest.fixture(scope="session")
@@ -103,6 +103,18 @@ def test_every_file_is_there(dataset: Path) -> None:
 def test_workers_do_not_change_a_byte(dataset: Path, recipe: Path, tmp_path: Path) -> None:
     _generate(recipe, tmp_path / "d", "--workers", "2")
     assert _tree(tmp_path / "d") == _tree(dataset)
+
+
+def test_parts_do_not_change_a_byte(dataset: Path, recipe: Path, tmp_path: Path) -> None:
+    out = tmp_path / "d"
+    parts = [
+        subprocess.Popen(
+            _command(recipe, out, "--part", f"{k}/2", "--workers", "1"), cwd=ROOT, stderr=subprocess.DEVNULL
+        )
+        for k in (1, 2)
+    ]
+    assert [part.wait(timeout=400) for part in parts] == [0, 0]
+    assert _tree(out) == _tree(dataset)
 
 
 def test_another_seed_changes_every_image(dataset: Path, recipe: Path, tmp_path: Path) -> None:

@@ -21,9 +21,10 @@ from hypothesis import strategies as st
 from posed import commit, open_dataset, tree
 
 from generator.changes import is_half_changed
-from generator.dataset import Dataset, DatasetError
+from generator.dataset import Dataset
 from generator.formats.bop import read_scene_json
 from generator.formats.files import read_json
+from generator.locks import LockedError, locked
 from generator.models import ObjectModel, load_models
 from generator.relabel import relabel
 from generator.symmetry import SymmetryTable
@@ -306,7 +307,7 @@ def test_what_is_no_dataset_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_a_dataset_at_work_is_left_alone(root: Path, models: dict[int, ObjectModel]) -> None:
-    with open_dataset(root, models).locked(), pytest.raises(DatasetError, match="another synthetless is writing"):
+    with locked(root), pytest.raises(LockedError, match="another synthetless is writing"):
         relabel(root, scheme="atlas", workers=1)
 
 
