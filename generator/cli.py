@@ -16,10 +16,11 @@ from generator.doctor import examine, is_fit, to_json, to_text
 from generator.fetch import fetch
 from generator.formats.files import atomic_write
 from generator.formats.images import encode_png
-from generator.generate import Execution, Summary, generate
+from generator.generate import Execution, Summary, generate, redo
 from generator.plan import Part
 from generator.replay import render_again
 from generator.review.sheet import write_contact_sheet
+from generator.studio import DropFailed
 from scenes.blender import BlenderError
 
 SHEET_FILE = "preview.jpg"
@@ -130,6 +131,20 @@ def render_command(
     """Render one recorded image again."""
     atomic_write(to, encode_png(render_again(dataset, scene, image, textures)))
     print(to)
+
+
+@app.command("redo")
+def redo_command(
+    dataset: Annotated[Path, typer.Argument(help="The dataset's folder.")],
+    drop: Annotated[int, typer.Argument(min=0, help="Number of the drop.")],
+    textures: Annotated[str | None, typer.Option(help="Folder of the photographs, if it has moved.")] = None,
+) -> None:
+    """Make one drop again, alone and in the foreground, to see why it failed."""
+    try:
+        made = redo(dataset, drop, textures)
+    except DropFailed as failure:
+        _quit(f"drop {drop}: {failure}", EXIT_FAILED)
+    print(f"drop {drop}: {made} images in {dataset}")
 
 
 @app.command("doctor")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import sys
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from tqdm import tqdm
@@ -10,11 +11,16 @@ from tqdm import tqdm
 from generator.config import Recipe
 from generator.dataset import DATASET_FILE, Dataset
 from generator.formats import bop
+from generator.formats.files import write_json
 from generator.locks import locked
 from generator.plan import Part, by_drop, plan_image
-from generator.sources import check_photos, load_sources
+from generator.replay import read_recipe
+from generator.sources import Sources, check_photos, load_sources
+from generator.studio import Studio
 from generator.workers import Job, Outcome, Workplace, run
+from scenes.sampling import sample_scene
 
+FAILURES_FOLDER = ".failures"
 _DROPS_BETWEEN_ASSEMBLIES = 50
 
 
@@ -74,7 +80,7 @@ def generate(recipe: Recipe, out: Path, execution: Execution) -> Summary:
         failures: list[Outcome] = []
         try:
             if missing:
-                failures = _make(dataset, missing, execution)
+                failures = _make(dataset, sources, missing, execution)
         finally:  # an interrupted dataset can be looked at, too
             dataset.assemble()
     return _summarise(dataset, len(missing) - len(_wanted(dataset, execution.part)), failures)
@@ -86,14 +92,48 @@ def _wanted(dataset: Dataset, part: Part | None) -> list[int]:
     return [number for number in dataset.missing() if part is None or part.takes(plan_image(number, views).drop)]
 
 
-def _make(dataset: Dataset, missing: list[int], execution: Execution) -> list[Outcome]:
+def redo(out: Path, drop: int, textures: str | None = None) -> int:
+    """Make the images of one drop again in this process, with all cores, and put them where they are missing.
+
+    Args:
+        out: the dataset's folder.
+        drop: number of the drop.
+        textures: folder of the photographs, if it has moved since.
+
+    Returns:
+        How many images were made.
+
+    Raises:
+        DropFailed: it does not come to rest.
+        ValueError: the dataset, or what it was made from, cannot be used.
+    """
+    recipe = read_recipe(out)
+    if textures is not None:
+        recipe = recipe.model_copy(update={"source": recipe.source.model_copy(update={"textures": textures})})
+    sources = load_sources(recipe)
+    dataset = Dataset.open(out, recipe, sources.models, sources.photos_digest)
+    views = recipe.camera.views_per_drop
+    plans = [plan_image(number, views) for number in range(drop * views, min((drop + 1) * views, recipe.images))]
+    if not plans:
+        raise ValueError(f"{out}: has no drop {drop}; its {recipe.images} images show the drops from 0 on")
+    with locked(out):
+        for image in Studio(recipe, sources).make(drop, plans):
+            dataset.commit(image)
+        (out / FAILURES_FOLDER / f"{drop:08d}.json").unlink(missing_ok=True)
+        dataset.assemble()
+    return len(plans)
+
+
+def _make(dataset: Dataset, sources: Sources, missing: list[int], execution: Execution) -> list[Outcome]:
     """Make the missing images; return the drops that failed, in their order."""
     failures: list[Outcome] = []
     jobs = [Job(drop, tuple(images)) for drop, images in by_drop(missing, dataset.recipe.camera.views_per_drop)]
     place = Workplace(dataset.recipe, dataset.root, execution.threads, execution.drop_limit_s)
-    with tqdm(total=len(missing), unit="image", mininterval=0.5, smoothing=0.05) as bar:
+    interval = 0.5 if sys.stderr.isatty() else 60.0
+    with tqdm(total=len(missing), unit="image", mininterval=interval, maxinterval=interval, smoothing=0.05) as bar:
         for count, outcome in enumerate(run(jobs, place, min(execution.workers, len(jobs))), start=1):
             bar.update(outcome.made)
+            _note_failure(dataset, sources, outcome)
             if outcome.failure:
                 failures.append(outcome)
                 bar.set_postfix(failed=len(failures))
@@ -102,11 +142,26 @@ def _make(dataset: Dataset, missing: list[int], execution: Execution) -> list[Ou
     return sorted(failures, key=lambda outcome: outcome.job.drop)
 
 
+def _note_failure(dataset: Dataset, sources: Sources, outcome: Outcome) -> None:
+    """Leave a note of a failed drop with the scene that it began with; take away that of one that went well."""
+    drop, recipe = outcome.job.drop, dataset.recipe
+    path = dataset.root / FAILURES_FOLDER / f"{drop:08d}.json"
+    if outcome.failure:
+        scene = sample_scene(recipe, sources.catalogue, recipe.seed, drop)
+        write_json(path, {"drop": drop, "failure": outcome.failure, "scene": asdict(scene)})
+    else:
+        path.unlink(missing_ok=True)
+
+
 def _summarise(dataset: Dataset, made: int, failures: list[Outcome]) -> Summary:
     images, fractions = 0, []
-    for scene_id in bop.scene_ids(dataset.root, dataset.recipe.split):
+    made_any = (dataset.root / dataset.recipe.split).is_dir()
+    for scene_id in bop.scene_ids(dataset.root, dataset.recipe.split) if made_any else []:
         infos = bop.read_scene_json(dataset.scene(scene_id).scene_gt_info)
         images += len(infos)
         fractions += [entry["visib_fract"] for entries in infos.values() for entry in entries]
     mean = sum(fractions) / len(fractions) if fractions else 0.0
-    return Summary(images, len(fractions), made, mean, tuple(f"drop {o.job.drop}: {o.failure}" for o in failures))
+    told = tuple(
+        f"drop {o.job.drop}: {o.failure}; try it alone: synthetless redo {dataset.root} {o.job.drop}" for o in failures
+    )
+    return Summary(images, len(fractions), made, mean, told)

@@ -76,7 +76,8 @@ class Workplace:
 def run(jobs: Iterable[Job], place: Workplace, workers: int) -> Iterator[Outcome]:
     """Make drops in worker processes, and tell of each as it ends, in no fixed order.
 
-    A drop that kills its worker, or hangs, is tried once more in another one and then reported; all others go on.
+    A drop that kills its worker is tried once more in another one and then reported, one that hangs is reported at
+    once; all others go on.
 
     Raises:
         DatasetError: a file of the dataset cannot be written; nothing further is made.
@@ -116,7 +117,7 @@ def _outcome(future: Future[Outcome], job: Job, place: Workplace) -> Outcome | N
     except (DatasetError, BlenderError):
         raise
     except TimeoutError:
-        return Outcome(job, failure=f"took longer than {place.drop_limit_s:g} s", killed=True)
+        return Outcome(job, failure=f"took longer than {place.drop_limit_s:g} s")
     except ProcessExpired as death:
         if death.exitcode == _RENEW:
             return None

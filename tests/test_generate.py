@@ -165,6 +165,18 @@ def test_drops_that_kill_hang_or_never_settle_do_not_stop_the_others(
     assert "worker died" in told["drop 0"]
     assert "60 s" in told["drop 1"]
     assert "did not come to rest" in told["drop 3"]
+    assert f"synthetless redo {out} 3" in told["drop 3"]
+    note = read_json(out / ".failures" / "00000003.json")
+    assert note["scene"]["drop"] == 3
+    redone = subprocess.run(
+        [sys.executable, "-m", "generator", "redo", str(out), "3"],
+        cwd=ROOT,
+        capture_output=True,
+        timeout=300,
+        check=True,
+    )
+    assert b"drop 3: 2 images" in redone.stdout
+    assert len(list((out / ".failures").iterdir())) == 2
     _generate(recipe, out, "--images", "6")
     ours = {name: content for name, content in _tree(dataset).items() if "/rgb/" in name}
     again = _tree(out)
