@@ -1,0 +1,224 @@
+// One image: its views, what is drawn into it, and what is told beside it. An image's data is a script of its own,
+// fetched when it is first looked at, since pages opened from the disk may read nothing but scripts and pictures.
+"use strict";
+
+synthetless.arrived = (key, detail) => synthetless.viewer.arrived(key, detail);
+
+synthetless.viewer = {
+  OVERLAYS: [
+    ["visible", "Visible masks"],
+    ["amodal", "Amodal outlines"],
+    ["true-box", "3D boxes, true pose"],
+    ["true-axes", "Axes, true pose"],
+    ["canonical-box", "3D boxes, canonical pose"],
+    ["canonical-axes", "Axes, canonical pose"],
+    ["ids", "Object ids"],
+    ["regressor", "Regressor index"],
+    ["margin", "Margin to the next jump"],
+  ],
+  WORDS: ["ids", "regressor", "margin"],
+  AT_FIRST: "visible canonical-box ids",
+  VIEWS: { rgb: ["Image", "i"], depth: ["Depth", "d"], normals: ["Normals", "n"] },
+  KEPT: 64, // images whose data stays in memory
+  details: new Map(),
+  last: null,
+
+  prepare() {
+    const { element } = synthetless;
+    this.drawing = document.getElementById("drawing");
+    const boxes = this.OVERLAYS.map(([name, title], at) => {
+      const box = element("input", { type: "checkbox", name, value: name });
+      box.addEventListener("change", () => this.toggle(name));
+      return element("label", {}, box, element("span", {}, title), element("kbd", { "aria-hidden": "true" }, String(at + 1)));
+    });
+    document.getElementById("overlays").append(...boxes);
+    document.getElementById("back").addEventListener("click", () => this.close());
+    document.getElementById("before").addEventListener("click", () => this.step(-1));
+    document.getElementById("after").addEventListener("click", () => this.step(1));
+    document.addEventListener("keydown", (event) => this.key(event));
+  },
+
+  overlays: () => new Set((synthetless.state().get("overlays") ?? synthetless.viewer.AT_FIRST).split(" ").filter(Boolean)),
+
+  toggle(name) {
+    const chosen = this.overlays();
+    if (!chosen.delete(name)) chosen.add(name);
+    synthetless.change({ overlays: [...chosen].join(" ") || " " });
+  },
+
+  open(key) {
+    this.last = key;
+    this.current = key;
+    const at = synthetless.found.indexOf(key);
+    const count = synthetless.found.length;
+    document.title = key;
+    document.getElementById("image-name").textContent = key;
+    document.getElementById("position").textContent = at < 0 ? "not among the filtered ones" : `${at + 1} of ${count}`;
+    document.getElementById("before").disabled = at <= 0;
+    document.getElementById("after").disabled = at === count - 1;
+    if (this.details.has(key)) this.draw(this.details.get(key));
+    else this.fetch(key);
+  },
+
+  fetch(key) {
+    const script = synthetless.element("script", { src: `data/${key}.js` });
+    script.addEventListener("load", () => script.remove());
+    script.addEventListener("error", () => {
+      script.remove();
+      document.getElementById("legend").textContent = `data/${key}.js is missing: make the preview again.`;
+    });
+    document.head.append(script);
+  },
+
+  arrived(key, detail) {
+    if (this.details.size >= this.KEPT) this.details.delete(this.details.keys().next().value);
+    this.details.set(key, detail);
+    if (key === this.current) this.draw(detail);
+  },
+
+  close() {
+    synthetless.change({ image: "" }, true);
+  },
+
+  step(by) {
+    const next = synthetless.found[Math.max(0, synthetless.found.indexOf(this.current)) + by];
+    if (next !== undefined) synthetless.change({ image: next });
+  },
+
+  draw(detail) {
+    const names = Object.keys(detail.views);
+    const asked = synthetless.state().get("view");
+    const view = names.includes(asked) ? asked : names[0];
+    this.drawViews(names, view);
+    const [width, height] = detail.size;
+    this.drawing.setAttribute("viewBox", `-0.5 -0.5 ${width} ${height}`); // pixel (i, j) has its centre at (i, j)
+    this.drawing.style.setProperty("--ratio", width / height);
+    const picture = view && svg("image", { href: detail.views[view], x: -0.5, y: -0.5, width, height });
+    const chosen = this.overlays();
+    for (const box of document.querySelectorAll("#overlays input")) box.checked = chosen.has(box.name);
+    const words = this.WORDS.filter((name) => chosen.has(name));
+    const layers = [...this.OVERLAYS.map(([name]) => name).filter((name) => !this.WORDS.includes(name)), "words"];
+    const groups = layers
+      .filter((name) => (name === "words" ? words.length : chosen.has(name)))
+      .map((name) => svg("g", { "data-overlay": name }, ...detail.instances.flatMap((instance) => this.layer(name, instance, words, detail.size))));
+    this.drawing.replaceChildren(...(picture ? [picture] : []), ...groups);
+    const legends = {
+      depth: () => `Depth: brightest at ${detail.depth_mm[0]} mm, darkest from ${detail.depth_mm[1]} mm on; black where there is none.`,
+      normals: () => "Normals in the camera's frame: x red, y green, z blue; mid-grey is zero.",
+    };
+    document.getElementById("legend").textContent = view in legends ? legends[view]() : "";
+    this.drawTable(detail);
+    this.drawSections(detail.sections);
+  },
+
+  // The shapes of one instance in one layer.
+  layer(name, instance, words, size) {
+    const style = `--class: ${synthetless.colour(instance.obj)}`;
+    const common = { "data-gt": instance.gt, style };
+    if (name === "words") return this.words(instance, words, size);
+    if (name === "visible" || name === "amodal") {
+      const d = instance.outlines[name];
+      return d ? [svg("path", { ...common, d, class: name })] : [];
+    }
+    const [pose, what] = name.split("-");
+    const kinds = what === "axes" ? ["x-axis", "y-axis", "z-axis"] : [];
+    return instance[pose][what].map(([x1, y1, x2, y2], at) =>
+      svg("line", { ...common, x1, y1, x2, y2, class: [pose, kinds[at] ?? "box"].join(" ") }));
+  },
+
+  words(instance, chosen, size) {
+    if (!instance.place.length) return [];
+    const margin = instance.margin >= 180 ? "no jump" : `${instance.margin.toFixed(1)}°`;
+    const texts = { ids: synthetless.className(instance.obj), regressor: `r${instance.regressor}`, margin };
+    const [x, y] = instance.place;
+    const text = svg("text", { x, y, "font-size": Math.max(...size) / 42, "data-gt": instance.gt });
+    text.textContent = chosen.map((name) => texts[name]).join(" · ");
+    return [text];
+  },
+
+  drawViews(names, view) {
+    const buttons = names.map((name) => {
+      const pressed = String(name === view);
+      const button = synthetless.element("button", { type: "button", "data-view": name, "aria-pressed": pressed }, this.VIEWS[name][0]);
+      button.addEventListener("click", () => synthetless.change({ view: name }));
+      return button;
+    });
+    document.getElementById("views").replaceChildren(...buttons);
+  },
+
+  drawTable(detail) {
+    const { element } = synthetless;
+    const rows = detail.instances.map((instance) => {
+      const dot = element("span", { class: "dot" });
+      dot.style.backgroundColor = synthetless.colour(instance.obj);
+      const [words, colour] = instance.material;
+      const swatch = element("span", words ? { class: "swatch", title: words, role: "img", "aria-label": words } : {});
+      if (colour) swatch.style.backgroundColor = colour;
+      const margin = instance.margin >= 180 ? "none" : `${instance.margin.toFixed(1)}°`;
+      const cells = [
+        `${(100 * instance.visib).toFixed(0)} %`, `${instance.regressor} of ${instance.regressors}`, margin,
+        `${instance.distance.toFixed(0)} mm`, swatch,
+      ];
+      const row = element("tr", { tabindex: "0" },
+        element("th", { scope: "row" }, dot, synthetless.className(instance.obj)), ...cells.map((cell) => element("td", {}, cell)));
+      if (instance.margin < 5) row.classList.add("near-jump");
+      for (const [on, off] of [["mouseenter", "mouseleave"], ["focus", "blur"]]) {
+        row.addEventListener(on, () => this.single(instance.gt));
+        row.addEventListener(off, () => this.single(null));
+      }
+      return row;
+    });
+    document.querySelector("#instances tbody").replaceChildren(...rows);
+  },
+
+  // Shows one instance alone, or all of them again.
+  single(gt) {
+    for (const shape of this.drawing.querySelectorAll("[data-gt]")) {
+      shape.classList.toggle("dimmed", gt !== null && shape.dataset.gt !== String(gt));
+    }
+  },
+
+  drawSections(sections) {
+    const { element } = synthetless;
+    const made = sections.map(({ title, rows }) => {
+      const list = element("dl");
+      for (const [name, value, colour] of rows) {
+        const told = element("dd");
+        if (colour) {
+          const swatch = element("span", { class: "swatch" });
+          swatch.style.backgroundColor = colour;
+          told.append(swatch, " ");
+        }
+        told.append(value);
+        list.append(element("dt", {}, name), told);
+      }
+      return element("section", {}, element("h3", {}, title), list);
+    });
+    document.getElementById("sections").replaceChildren(...made);
+  },
+
+  key(event) {
+    if (document.getElementById("viewer").hidden || document.getElementById("help").open) return;
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input[type=number], select")) return;
+    const views = Object.entries(this.VIEWS).map(([view, [, letter]]) => [letter, () => synthetless.change({ view })]);
+    const toggles = this.OVERLAYS.map(([name], at) => [String(at + 1), () => this.toggle(name)]);
+    const actions = {
+      Escape: () => this.close(),
+      ArrowLeft: () => this.step(-1),
+      ArrowRight: () => this.step(1),
+      0: () => synthetless.change({ overlays: " " }),
+      ...Object.fromEntries([...views, ...toggles]),
+    };
+    if (event.key in actions) {
+      event.preventDefault();
+      actions[event.key]();
+    }
+  },
+};
+
+function svg(name, attributes, ...children) {
+  const made = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  made.append(...children);
+  return made;
+}
