@@ -11,13 +11,17 @@ from typing import Annotated, Any, Literal, NoReturn
 
 import typer
 
+from generator.adopt import adopt
 from generator.config import load_recipe, settings
 from generator.doctor import examine, is_fit, to_json, to_text
 from generator.fetch import fetch
+from generator.formats.coco import export_coco
 from generator.formats.files import atomic_write
 from generator.formats.images import encode_png
+from generator.formats.webdataset import export_webdataset, relabel_webdataset
 from generator.generate import Execution, Summary, generate, redo
 from generator.plan import Part
+from generator.relabel import relabel
 from generator.replay import render_again
 from generator.review.sheet import write_contact_sheet
 from generator.studio import DropFailed
@@ -32,6 +36,14 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
+
+export = typer.Typer(help="Write the dataset in other formats.", no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(export, name="export")
+
+TableOption = Annotated[Path | None, typer.Option(help="Symmetry table (YAML or JSON); it may name some objects only.")]
+SchemeOption = Annotated[
+    Literal["pitteri2019", "atlas"] | None, typer.Option(help="How labels are made; the table's own if not given.")
+]
 
 
 def main() -> None:
@@ -145,6 +157,57 @@ def redo_command(
     except DropFailed as failure:
         _quit(f"drop {drop}: {failure}", EXIT_FAILED)
     print(f"drop {drop}: {made} images in {dataset}")
+
+
+@app.command("relabel")
+def relabel_command(
+    dataset: Annotated[Path, typer.Argument(help="The dataset's folder.")],
+    symmetries: TableOption = None,
+    scheme: SchemeOption = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only tell what would change.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the changes as JSON.")] = False,
+) -> None:
+    """Make the labels those of other symmetries; images stay. Without options: make all labels again."""
+    done = relabel(dataset, symmetries, scheme, dry_run)
+    print(json.dumps(asdict(done)) if as_json else done)
+
+
+@app.command("adopt")
+def adopt_command(
+    dataset: Annotated[Path, typer.Argument(help="Folder of a BOP dataset, with or without images.")],
+    models: Annotated[Path | None, typer.Option(help="Folder of its models_info.json, if not inside.")] = None,
+    symmetries: TableOption = None,
+    scheme: SchemeOption = None,
+) -> None:
+    """Put labels beside the files of an existing BOP dataset, whose own files stay as they are."""
+    print(adopt(dataset, models, symmetries, scheme))
+
+
+@export.command("coco")
+def export_coco_command(
+    dataset: Annotated[Path, typer.Argument(help="The dataset's folder.")],
+    to: Annotated[Path, typer.Option(help="JSON file to write.")],
+    boxes: Annotated[Literal["visible", "amodal"], typer.Option(help="What the boxes hold.")] = "visible",
+) -> None:
+    """Write one COCO file for the whole split, with canonical poses and box corners as keypoints."""
+    print(f"{export_coco(dataset, to, boxes=boxes)} images in {to}")
+
+
+@export.command("webdataset")
+def export_webdataset_command(
+    dataset: Annotated[Path, typer.Argument(help="The dataset's folder.")],
+    to: Annotated[Path, typer.Option(help="Folder of the shards.")],
+    images_per_shard: Annotated[int, typer.Option(min=1, help="Images in a shard, at most.")] = 1000,
+    shuffle_seed: Annotated[int | None, typer.Option(help="Shuffle the images by this seed.")] = None,
+    relabel_only: Annotated[bool, typer.Option("--relabel-only", help="Renew the labels of existing shards.")] = False,
+) -> None:
+    """Write BOP webdataset shards, with the labels in .gt_canonical.json."""
+    if relabel_only:
+        relabel_webdataset(dataset, to)
+        print(f"labels renewed in {to}")
+        return
+    shards = export_webdataset(dataset, to, images_per_shard=images_per_shard, shuffle_seed=shuffle_seed)
+    print(f"{len(shards)} images in {len(set(shards.values()))} shards in {to}")
 
 
 @app.command("doctor")

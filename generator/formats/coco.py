@@ -15,6 +15,7 @@ from typing import Any, Literal
 from pycocotools import mask as coco_mask
 from tqdm import tqdm
 
+from generator.changes import refuse_half_changed
 from generator.formats.bop import Entry, ScenePaths, find_split, scene_ids
 from generator.formats.files import atomic_file, read_json
 from generator.formats.scene import ImageLabels, read_scene
@@ -47,6 +48,7 @@ def export_coco(dataset: Path, to: Path, split: str | None = None, boxes: BoxKin
     Raises:
         ValueError: the dataset is incomplete or contradicts itself, or the file cannot be written.
     """
+    refuse_half_changed(dataset)
     split = split or find_split(dataset)
     licence = _licence(dataset)
     categories: dict[int, Entry] = {}

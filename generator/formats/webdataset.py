@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from generator.changes import refuse_half_changed
 from generator.formats.bop import Entry, ScenePaths, find_split, scene_ids, uncompressed_rle
 from generator.formats.files import atomic_file, atomic_folder, atomic_write, read_bytes, write_json
 from generator.formats.images import decode_mask
@@ -77,6 +78,7 @@ def export_webdataset(
     """
     if not 1 <= images_per_shard <= MAX_IMAGES_PER_SHARD:
         raise ValueError(f"images_per_shard is {images_per_shard}; 1 to {MAX_IMAGES_PER_SHARD} are possible")
+    refuse_half_changed(dataset)
     images = list(_images(dataset, split or find_split(dataset)))
     if shuffle_seed is not None:
         order = np.random.default_rng(np.random.SeedSequence(shuffle_seed)).permutation(len(images))
@@ -111,6 +113,7 @@ def relabel_webdataset(
     paths = sorted(shards.glob("shard-*.tar"))
     if not paths:
         raise ValueError(f"{shards}: holds no shards (shard-000000.tar, ...); export first")
+    refuse_half_changed(dataset)
     images = {image.key: image for image in _images(dataset, split or find_split(dataset))}
     keys = [list(dict.fromkeys(_key(name) for name in _names(path))) for path in paths]
     key_to_shard = {key: number for number, shard in enumerate(keys) for key in shard}
