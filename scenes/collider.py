@@ -168,14 +168,22 @@ def _spanned(points: Array, hollows: Array) -> Array:
 
 def _simplified(points: Array) -> Array:
     """Corners of a hull that no point sticks out of further than ``SIMPLIFY_M``."""
-    hull = ConvexHull(points, qhull_options="QJ")
-    corners = points[hull.vertices]
+    corners = points[_hull(points).vertices]
     grid = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3)
     kept = np.unique((corners @ grid[grid.any(axis=1)].T).argmax(axis=0))
+    if len(kept) < 4:  # too slender to simplify
+        return np.asarray(corners)
     while True:
-        planes = ConvexHull(corners[kept], qhull_options="QJ").equations
+        planes = _hull(corners[kept]).equations
         heights = corners @ planes[:, :3].T + planes[:, 3]
         further = np.setdiff1d(heights.argmax(axis=0)[heights.max(axis=0) > SIMPLIFY_M], kept)
         if not len(further):
             return np.asarray(corners[kept])
         kept = np.union1d(kept, further)
+
+
+def _hull(points: Array) -> ConvexHull:
+    try:
+        return ConvexHull(points)
+    except QhullError:
+        return ConvexHull(points, qhull_options="QJ")  # all in one plane: joggled out of it a little
