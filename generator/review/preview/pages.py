@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+from collections.abc import Mapping
 from importlib.resources import as_file, files
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from generator.formats.files import atomic_write
+from generator.review.sheet import class_color
+from generator.review.statistics import Statistics
+from generator.review.statistics.plots import plots
 
-PAGE_FILE = "index.html"
+PAGE_FILE, STATISTICS_FILE = "index.html", "statistics.json"
 STATIC_FILES = ("preview.css", "gallery.js", "viewer.js")
+_GROUPS = ("labels", "objects", "camera", "light", "table", "image")
 _PACKAGE = "generator.review.preview"
 _MARK = '<meta name="generator" content="synthetless preview">'
 
@@ -35,6 +42,28 @@ def write_pages(folder: Path, title: str, split: str, images: int) -> None:
             shutil.copyfile(path, folder / name)
 
 
+def write_statistics(folder: Path, title: str, of: Statistics, names: Mapping[int, str]) -> None:
+    """Write the page of the statistics, its plots, and the numbers as JSON; ``names`` are the objects', by id.
+
+    Raises:
+        ValueError: as ``write_pages``.
+    """
+    content = json.dumps(of.to_json(), indent=1, allow_nan=False)
+    atomic_write(folder / STATISTICS_FILE, f"{content}\n".encode())
+    for name, svg in plots(of):
+        atomic_write(folder / "plots" / f"{name}.svg", svg)
+    ordered = sorted(of.distributions, key=lambda each: _GROUPS.index(each.group))
+    groups = [(group, list(members)) for group, members in groupby(ordered, key=lambda each: each.group)]
+    page = render(
+        "statistics.html", title=title, of=of, groups=groups, names=names, recipe=of.drops > 0, colour=_colour
+    )
+    atomic_write(folder / "statistics.html", page.encode())
+
+
+def _colour(obj_id: int) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*class_color(obj_id))
+
+
 def render(template: str, **values: Any) -> str:
     """A template filled in; every value is escaped.
 
@@ -52,4 +81,4 @@ def render(template: str, **values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(template).render(mark=_MARK, **values)
+    return environment.get_template(template).render(**values)

@@ -24,7 +24,8 @@ from generator.formats.scene import ImageLabels, read_scene
 from generator.models import INFO_FILE, read_models_info
 from generator.replay import read_recorded
 from generator.review.preview.image import ImageTask, write_image
-from generator.review.preview.pages import PAGE_FILE, is_ours, write_pages
+from generator.review.preview.pages import PAGE_FILE, is_ours, write_pages, write_statistics
+from generator.review.statistics import statistics
 
 DEFAULT_FOLDER = "preview"
 _MODELS_FOLDERS = ("models", "models_cad", "models_eval")
@@ -66,6 +67,8 @@ def write_preview(
     with atomic_folder(fresh) as folder:
         _write_images(source, folder, workers or len(os.sched_getaffinity(0)))
         write_pages(folder, source.title, source.split, source.count)
+        names = {obj_id: class_name(obj_id, info) for obj_id, info in source.infos.items()}
+        write_statistics(folder, source.title, statistics(dataset, source.split), names)
     if to.exists():
         shutil.rmtree(to)
     fresh.replace(to)
