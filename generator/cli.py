@@ -16,13 +16,15 @@ from generator.config import load_recipe, settings
 from generator.doctor import examine, is_fit, to_json, to_text
 from generator.fetch import fetch
 from generator.formats.coco import export_coco
-from generator.formats.files import atomic_write
+from generator.formats.files import atomic_write, read_json
 from generator.formats.images import encode_png
 from generator.formats.webdataset import export_webdataset, relabel_webdataset
 from generator.generate import Execution, Summary, generate, redo
 from generator.plan import Part
 from generator.relabel import relabel
 from generator.replay import render_again
+from generator.review.preview import write_preview
+from generator.review.preview.pages import STATISTICS_FILE
 from generator.review.sheet import write_contact_sheet
 from generator.studio import DropFailed
 from scenes.blender import BlenderError
@@ -208,6 +210,21 @@ def export_webdataset_command(
         return
     shards = export_webdataset(dataset, to, images_per_shard=images_per_shard, shuffle_seed=shuffle_seed)
     print(f"{len(shards)} images in {len(set(shards.values()))} shards in {to}")
+
+
+@app.command("preview")
+def preview_command(
+    dataset: Annotated[Path, typer.Argument(help="Folder of a dataset.")],
+    to: Annotated[Path | None, typer.Option(help="Folder of the pages; DIR/preview if not given.")] = None,
+    split: Annotated[str | None, typer.Option(help="Folder of images, where there are several.")] = None,
+    images: Annotated[int | None, typer.Option(min=1, help="Show at most so many, evenly spread.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores if not given.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the statistics as JSON.")] = False,
+) -> None:
+    """Make pages that show a dataset, and its statistics, in any browser."""
+    page = write_preview(dataset, to, split, images, workers)
+    statistics = read_json(page.parent / STATISTICS_FILE)
+    print(json.dumps({"page": str(page), "statistics": statistics}) if as_json else f"preview: {page}")
 
 
 @app.command("doctor")
