@@ -1,0 +1,145 @@
+"""Masks of one image: against each other, against scene_gt_info.json and against what the poses allow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from generator.annotation import Box
+from generator.formats.bop import Entry, ScenePaths
+from generator.formats.images import decode_mask
+from generator.review.validate.geometry import Array, contains, silhouette_limits, window_box
+from generator.review.validate.pictures import Pictures
+from generator.review.validate.regions import Mask, Region
+from generator.review.validate.report import Finding
+from generator.review.validate.source import Source
+from generator.visibility import NO_BOX, canvas_window, image_window
+
+_SAME_FRACTION = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class InstanceMasks:
+    """The masks of one instance; None where a file is missing or unusable, or not asked for."""
+
+    whole: Region | None = None
+    visible: Region | None = None
+
+
+def read_masks(scene: ScenePaths, im_id: int, n_instances: int, pictures: Pictures) -> list[InstanceMasks]:
+    """The two mask files of every instance of an image."""
+    masks = []
+    for gt_id in range(n_instances):
+        pixels: Mask | None = pictures.read(scene.mask(im_id, gt_id), decode_mask, gt_id)
+        visible: Mask | None = pictures.read(scene.mask_visib(im_id, gt_id), decode_mask, gt_id)
+        whole = None if pixels is None else Region.of(pixels)
+        same = visible is pixels  # the same bytes are decoded once
+        masks.append(InstanceMasks(whole, whole if same or visible is None else Region.of(visible)))
+    return masks
+
+
+def check_masks(source: Source, scene: ScenePaths, im_id: int, masks: Sequence[InstanceMasks]) -> Iterator[Finding]:
+    """The visible part is part of the whole, and no pixel shows two instances."""
+    exact = source.recipe.labels.visibility_delta_mm == 0
+    camera = source.recipe.intrinsics
+    owner = np.full((camera.height, camera.width), -1, dtype=np.int16)
+    for gt_id, mask in enumerate(masks):
+        if mask.visible is None or mask.visible.count == 0:
+            continue
+        path, crop, seen = scene.mask_visib(im_id, gt_id), mask.visible.crop, mask.visible.inside
+        if mask.whole is not None and mask.whole is not mask.visible:
+            outside = int(np.count_nonzero(seen & ~mask.whole.pixels[crop]))
+            if outside:
+                yield Finding("mask", path, f"{outside} pixels are not in the whole silhouette, mask/", im_id, gt_id)
+        if exact:
+            others = owner[crop][seen]
+            if (others >= 0).any():
+                shared, other = int(np.count_nonzero(others >= 0)), int(others.max())
+                message = f"{shared} pixels are visible of instance {other}, too; a pixel shows one instance"
+                yield Finding("mask", path, message, im_id, gt_id)
+            owner[crop][seen] = gt_id
+
+
+def check_info(
+    source: Source,
+    scene: ScenePaths,
+    im_id: int,
+    gt_id: int,
+    pose: Entry,
+    info: Entry,
+    masks: InstanceMasks,
+    depth: Array | None,
+) -> Iterator[Finding]:
+    """Counts, fraction and boxes of an instance: against each other, the pose and, as bop_toolkit counts, its masks.
+
+    Args:
+        source: the dataset.
+        scene: the files of the scene folder.
+        im_id, gt_id: the image and the instance.
+        pose, info: its entries in scene_gt.json and scene_gt_info.json.
+        masks: its masks, as far as there are any.
+        depth: (H, W) millimetres, 0 for none; or None.
+    """
+    limits = _limits(source, pose)
+    faults = [*_contradictions(info), *_check_box(source, info, limits), *_recount_visible(info, masks.visible)]
+    if masks.whole is not None:
+        inside = limits is not None and contains(window_box(image_window(source.recipe.intrinsics)), limits)
+        faults += _recount_whole(info, masks.whole, depth, inside)
+    yield from (Finding("gt_info", scene.scene_gt_info, fault, im_id, gt_id) for fault in faults)
+
+
+def _contradictions(info: Entry) -> Iterator[str]:
+    visible, valid, whole = (info[f"px_count_{name}"] for name in ("visib", "valid", "all"))
+    if not visible <= valid <= whole:
+        yield f"px_count_visib {visible} <= px_count_valid {valid} <= px_count_all {whole} does not hold"
+    fraction = visible / whole if whole else 0.0
+    if abs(info["visib_fract"] - fraction) > _SAME_FRACTION:
+        yield f"visib_fract is {info['visib_fract']}; {visible} of {whole} pixels are {fraction}"
+    for name in ("bbox_obj", "bbox_visib"):
+        if (_box(info[name]) == NO_BOX) != (visible == 0):
+            yield f"{name} is {info[name]}; it is [-1, -1, -1, -1] where nothing is visible, and only there"
+
+
+def _check_box(source: Source, info: Entry, limits: Box | None) -> Iterator[str]:
+    """The whole silhouette is on bop_toolkit's canvas, and where the pose can put it."""
+    box = _box(info["bbox_obj"])
+    if box == NO_BOX:
+        return
+    if not contains(window_box(canvas_window(source.recipe.intrinsics)), box):
+        yield f"bbox_obj is {list(box)}, beyond the canvas of three times the image"
+    elif limits is not None and not contains(limits, box):
+        yield f"bbox_obj is {list(box)}; the pose allows nothing outside {list(limits)}"
+
+
+def _recount_visible(info: Entry, visible: Region | None) -> Iterator[str]:
+    if visible is not None:
+        if info["px_count_visib"] != visible.count:
+            yield f"px_count_visib is {info['px_count_visib']}; mask_visib/ has {visible.count}"
+        if _box(info["bbox_visib"]) != visible.box:
+            yield f"bbox_visib is {info['bbox_visib']}; mask_visib/ has {list(visible.box)}"
+
+
+def _recount_whole(info: Entry, whole: Region, depth: Array | None, inside: bool) -> Iterator[str]:
+    """``inside`` says that the silhouette cannot leave the image, so that the mask has all of it."""
+    valid = whole.count if depth is None else int(np.count_nonzero(whole.inside & (depth[whole.crop] > 0)))
+    if info["px_count_valid"] != valid:
+        yield f"px_count_valid is {info['px_count_valid']}; mask/ has {valid} where there is depth"
+    if info["px_count_all"] != whole.count if inside else info["px_count_all"] < whole.count:
+        yield f"px_count_all is {info['px_count_all']}; mask/ has {whole.count}"
+    box = _box(info["bbox_obj"])
+    if box != NO_BOX and (box != whole.box if inside else not contains(box, whole.box)):
+        yield f"bbox_obj is {info['bbox_obj']}; mask/ has {list(whole.box)}"
+
+
+def _limits(source: Source, pose: Entry) -> Box | None:
+    if pose["obj_id"] not in source.shapes:
+        return None
+    R = np.array(pose["cam_R_m2c"]).reshape(3, 3)
+    return silhouette_limits(source.recipe.intrinsics, source.shapes[pose["obj_id"]], R, np.array(pose["cam_t_m2c"]))
+
+
+def _box(entry: Sequence[int]) -> Box:
+    x, y, w, h = entry
+    return x, y, w, h

@@ -1,0 +1,171 @@
+"""What a validation found: each fault with its file, image, instance and expectation."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+Kind = Literal[
+    "missing",  # a file, an image or an export member that should be there
+    "stray",  # a file that belongs to nothing
+    "unreadable",  # cut off, damaged, or no JSON or image at all
+    "schema",  # JSON of another form
+    "ids",  # files that disagree about which images and instances there are
+    "counts",  # dataset.json's totals
+    "picture",  # an image of another size or kind
+    "models",  # models/ against dataset.json and models_info.json
+    "symmetries",  # symmetries.json itself
+    "camera",  # cameras against the recipe and against scene_spec.jsonl
+    "pose",  # poses that are none, or that scene_spec.jsonl contradicts
+    "spec",  # scene_spec.jsonl against the plan and scene_gt.json
+    "gt_info",  # counts, fractions and boxes
+    "mask",  # masks against each other
+    "depth",  # depth against poses, masks and the table
+    "geometry",  # normals and object coordinates
+    "coco",  # scene_gt_coco.json
+    "canonical",  # labels that do not follow from poses and symmetries
+    "stale",  # labels of other symmetries
+    "export",  # an export that differs from its source
+    "deep",  # what casting the rays again contradicts
+]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One fault.
+
+    Attributes:
+        kind: of fault.
+        file: where it is.
+        message: what is there and what was expected.
+        image: BOP image id within its scene folder.
+        instance: gt_id within the image.
+    """
+
+    kind: Kind
+    file: Path
+    message: str
+    image: int | None = None
+    instance: int | None = None
+
+
+def bare(error: Exception, path: Path) -> str:
+    """An error's message without the file's name, which a finding states anyway."""
+    return str(error).removeprefix(f"{path}: ").removeprefix(f"{path}, ")
+
+
+def unusable(path: Path, error: Exception) -> Finding:
+    """The finding for a file that cannot be read."""
+    if not path.exists():
+        return Finding("missing", path, "not there")
+    if path.stat().st_size == 0:
+        return Finding("unreadable", path, "is empty: zero bytes")
+    return Finding("unreadable", path, bare(error, path))
+
+
+class Tally:
+    """Findings of one part of a dataset: every one is counted, the first of each kind are kept."""
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self.counts: Counter[Kind] = Counter()
+        self.kept: list[Finding] = []
+        self._n_kept: Counter[Kind] = Counter()
+
+    def add(self, findings: Iterable[Finding]) -> bool:
+        """Take findings; whether there were none."""
+        before = self.counts.total()
+        for finding in findings:
+            self.counts[finding.kind] += 1
+            self._keep(finding)
+        return self.counts.total() == before
+
+    def merge(self, other: Tally) -> None:
+        """Take another part's findings, after one's own."""
+        self.counts += other.counts
+        for finding in other.kept:
+            self._keep(finding)
+
+    def _keep(self, finding: Finding) -> None:
+        if self._n_kept[finding.kind] < self.limit:
+            self._n_kept[finding.kind] += 1
+            self.kept.append(finding)
+
+
+@dataclass(frozen=True)
+class Report:
+    """The result of a validation.
+
+    Attributes:
+        root: the dataset's folder.
+        images, instances: how many were looked at.
+        deep_images: of how many the rays were cast again.
+        exports: what was compared with the dataset.
+        findings: the first faults of each kind.
+        counts: of all faults, by kind.
+        notes: what could not be checked, and why.
+    """
+
+    root: Path
+    images: int
+    instances: int
+    deep_images: int
+    exports: tuple[Path, ...]
+    findings: tuple[Finding, ...]
+    counts: dict[str, int]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def valid(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.counts
+
+    def lines(self) -> list[str]:
+        """For people: faults grouped by kind, then the sum."""
+        lines: list[str] = []
+        for kind, count in self.counts.items():
+            shown = [finding for finding in self.findings if finding.kind == kind]
+            lines += [f"{kind}: {self._place(finding)}: {finding.message}" for finding in shown]
+            if count > len(shown):
+                lines.append(f"{kind}: ... and {count - len(shown)} more")
+        lines += [f"note: {note}" for note in self.notes]
+        deep = f", {self.deep_images} of them ray-cast again" if self.deep_images else ""
+        exports = f", {len(self.exports)} exports" if self.exports else ""
+        faults = sum(self.counts.values())
+        verdict = "valid" if self.valid else f"{faults} fault{'s' if faults > 1 else ''}"
+        return [*lines, f"{self.root}: {self.images} images{deep}, {self.instances} instances{exports}: {verdict}"]
+
+    def to_json(self) -> dict[str, Any]:
+        """For scripts: plain values."""
+        return {
+            "dataset": str(self.root),
+            "valid": self.valid,
+            "images": self.images,
+            "instances": self.instances,
+            "deep_images": self.deep_images,
+            "exports": [str(path) for path in self.exports],
+            "counts": self.counts,
+            "findings": [
+                {
+                    "kind": finding.kind,
+                    "file": self._relative(finding.file),
+                    "image": finding.image,
+                    "instance": finding.instance,
+                    "message": finding.message,
+                }
+                for finding in self.findings
+            ],
+            "notes": list(self.notes),
+        }
+
+    def _place(self, finding: Finding) -> str:
+        image = "" if finding.image is None else f", image {finding.image}"
+        instance = "" if finding.instance is None else f", instance {finding.instance}"
+        return f"{self._relative(finding.file)}{image}{instance}"
+
+    def _relative(self, path: Path) -> str:
+        return path.relative_to(self.root).as_posix() if path.is_relative_to(self.root) else str(path)

@@ -1,0 +1,182 @@
+"""Validates a dataset: hands the scene folders to workers and puts together what they find."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from importlib.util import find_spec
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from tqdm import tqdm
+
+from generator.dataset import DATASET_FILE
+from generator.review.validate.coco_export import check_coco_export
+from generator.review.validate.deep import DeepTask, check_deep, sample
+from generator.review.validate.report import KINDS, Finding, Report, Tally
+from generator.review.validate.scene import SceneResult, SceneTask, check_scene
+from generator.review.validate.source import (
+    Source,
+    check_counts,
+    check_folders,
+    plans_by_scene,
+    read_header,
+    read_source,
+)
+from generator.review.validate.webdataset import Shards, ShardsTask, by_scene, check_companions, check_shards
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+_DEEP_IMAGES_PER_TASK = 25
+
+
+def validate(
+    dataset: Path,
+    deep: bool = False,
+    exports: Sequence[Path] = (),
+    limit: int = 20,
+    workers: int | None = None,
+    deep_images: int = 100,
+) -> Report:
+    """Check a dataset, and exports made from it.
+
+    Args:
+        dataset: its folder, as ``generate`` fills it.
+        deep: also cast the rays of some images again.
+        exports: COCO files and folders of shards that were made from the dataset.
+        limit: how many faults of each kind to report in full; all are counted.
+        workers: processes; one per available core if None.
+        deep_images: how many images to cast again, evenly spread.
+
+    Raises:
+        ValueError: there is no dataset, or an export is not there or of no known kind.
+    """
+    root, exports = dataset.resolve(), tuple(path.resolve() for path in exports)
+    _require(root, exports, limit)
+    header, findings = read_header(root)
+    tally = Tally(limit)
+    tally.add(findings)
+    if header is None:
+        return _report(root, tally, exports=exports)
+    source, findings = read_source(root, header)
+    tally.add(findings)
+    plans = plans_by_scene(source.recipe)
+    tally.add(check_folders(root, source.recipe, list(plans)))
+    with _workers(workers, max(len(plans), -(-deep_images // _DEEP_IMAGES_PER_TASK) * deep)) as run:
+        tasks = [SceneTask(source, scene_id, tuple(of_scene), limit) for scene_id, of_scene in plans.items()]
+        scenes = list(run(check_scene, tasks, "validating"))
+        for scene in scenes:
+            tally.merge(scene.tally)
+        tally.add(_check_staleness(source, scenes))
+        images, instances = sum(len(s.image_ids) for s in scenes), sum(s.instances for s in scenes)
+        tally.add(check_counts(root, header, images, instances))
+        compared, skipped = _check_deep(source, scenes, deep_images, run, tally) if deep else (0, 0)
+        for export in exports:
+            if export.is_dir():
+                _check_shards(source, scenes, export, run, tally)
+            else:
+                tally.add(check_coco_export(source, export))
+    return _report(root, tally, images, instances, compared, exports, tuple(_notes(source, skipped)))
+
+
+class _Run(Protocol):
+    """Calls a function with every task, in this process or in several; results in the tasks' order."""
+
+    def __call__(self, function: Callable[[Task], Result], tasks: Sequence[Task], what: str) -> Iterator[Result]: ...
+
+
+@contextmanager
+def _workers(workers: int | None, n_tasks: int) -> Iterator[_Run]:
+    processes = min(workers or len(os.sched_getaffinity(0)), n_tasks)
+
+    def in_this_process(function: Callable[[Task], Result], tasks: Sequence[Task], what: str) -> Iterator[Result]:
+        return (function(task) for task in tqdm(tasks, desc=what, unit="part", disable=None))
+
+    if processes <= 1:
+        yield in_this_process
+        return
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+
+        def in_several(function: Callable[[Task], Result], tasks: Sequence[Task], what: str) -> Iterator[Result]:
+            return iter(tqdm(pool.map(function, tasks), total=len(tasks), desc=what, unit="part", disable=None))
+
+        yield in_several
+
+
+def _require(root: Path, exports: Sequence[Path], limit: int) -> None:
+    if limit < 0:
+        raise ValueError(f"limit is {limit}; a number of faults >= 0 is needed")
+    if not root.is_dir():
+        raise ValueError(f"{root}: no such dataset folder")
+    if not (root / DATASET_FILE).exists() and not any(root.glob("*/*/scene_spec.jsonl")):
+        raise ValueError(f"{root}: no {DATASET_FILE}; give a folder that generate filled")
+    for path in exports:
+        if not path.exists():
+            raise ValueError(f"{path}: no such export; give a COCO file or a folder of shards")
+        if path.is_dir() and not any(path.glob("shard-*.tar")):
+            raise ValueError(f"{path}: holds no shards (shard-000000.tar, ...)")
+
+
+def _check_staleness(source: Source, scenes: Sequence[SceneResult]) -> Iterator[Finding]:
+    """Name the scene folders whose labels are of other symmetries than symmetries.json."""
+    stale = [scene for scene in scenes if scene.stale]
+    half = len(stale) < sum(1 for scene in scenes if scene.image_ids)
+    for scene in stale:
+        objects = ", ".join(map(str, scene.stale))
+        yield Finding(
+            "stale",
+            source.scene(scene.scene_id).scene_gt_canonical,
+            f"labels of object {objects} are of other symmetries than symmetries.json; "
+            + ("other scene folders have them, the dataset is half relabelled: run relabel" if half else "run relabel"),
+        )
+
+
+def _check_deep(source: Source, scenes: Sequence[SceneResult], count: int, run: _Run, tally: Tally) -> tuple[int, int]:
+    """Cast rays again; returns how many images were compared, and how many could not be."""
+    places = sample({scene.scene_id: scene.image_ids for scene in scenes}, count)
+    tasks = []
+    for start in range(0, len(places), _DEEP_IMAGES_PER_TASK):
+        chunk = places[start : start + _DEEP_IMAGES_PER_TASK]
+        images = {scene_id: tuple(im_id for of, im_id in chunk if of == scene_id) for scene_id, _ in chunk}
+        tasks.append(DeepTask(source, images, tally.limit))
+    results = list(run(check_deep, tasks, "casting rays"))
+    for result in results:
+        tally.merge(result.tally)
+    return sum(result.compared for result in results), sum(result.skipped for result in results)
+
+
+def _check_shards(source: Source, scenes: Sequence[SceneResult], folder: Path, run: _Run, tally: Tally) -> None:
+    shards = Shards.read(folder)
+    members, strangers = by_scene(shards, {scene.scene_id for scene in scenes if scene.image_ids})
+    tally.add([*shards.findings, *check_companions(source, folder), *strangers])
+    tasks = [ShardsTask(source, scene_id, folder, of, tally.limit) for scene_id, of in members.items()]
+    for result in run(check_shards, tasks, folder.name):
+        tally.merge(result)
+
+
+def _notes(source: Source, skipped: int) -> Iterator[str]:
+    if source.has("exr") and find_spec("OpenEXR") is None:
+        yield "exr/ was not decoded: the OpenEXR package is not installed"
+    if skipped:
+        yield (
+            f"the rays of {skipped} images were not cast again: their labels are unsound, "
+            "or the distractors' models are not where the recipe has them"
+        )
+
+
+def _report(
+    root: Path,
+    tally: Tally,
+    images: int = 0,
+    instances: int = 0,
+    compared: int = 0,
+    exports: tuple[Path, ...] = (),
+    notes: tuple[str, ...] = (),
+) -> Report:
+    counts: dict[str, int] = {kind: tally.counts[kind] for kind in KINDS if tally.counts[kind]}
+    findings = tuple(finding for kind in KINDS for finding in tally.kept if finding.kind == kind)
+    return Report(root, images, instances, compared, exports, findings, counts, notes)

@@ -1,0 +1,68 @@
+"""One scene folder: its labels, its files, its images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from generator.plan import ImagePlan
+from generator.review.validate.canonical import check_canonical
+from generator.review.validate.coco import match_annotations
+from generator.review.validate.files import check_files
+from generator.review.validate.images import ImageCheck
+from generator.review.validate.labels import SceneLabels, check_agreement
+from generator.review.validate.poses import check_cameras, check_poses, check_specs
+from generator.review.validate.report import Tally
+from generator.review.validate.source import Source
+
+
+@dataclass(frozen=True, eq=False)
+class SceneTask:
+    """What a worker is given: the dataset, a scene folder, the images it should hold, and how many faults to keep."""
+
+    source: Source
+    scene_id: int
+    plans: tuple[ImagePlan, ...]
+    limit: int
+
+
+@dataclass(frozen=True, eq=False)
+class SceneResult:
+    """What a worker gives back.
+
+    Attributes:
+        scene_id: the scene folder.
+        tally: its faults.
+        image_ids: of the images it holds.
+        instances: how many there are in them.
+        stale: objects that are labelled by other symmetries.
+    """
+
+    scene_id: int
+    tally: Tally
+    image_ids: tuple[int, ...] = ()
+    instances: int = 0
+    stale: tuple[int, ...] = ()
+
+
+def check_scene(task: SceneTask) -> SceneResult:
+    """Check a scene folder; one that is not there has no faults of its own."""
+    source, tally = task.source, Tally(task.limit)
+    paths = source.scene(task.scene_id)
+    if not paths.root.is_dir():
+        return SceneResult(task.scene_id, tally)
+    labels = SceneLabels.read(paths)
+    tally.add(labels.findings)
+    tally.add(check_agreement(labels, task.plans))
+    tally.add(check_files(source, labels))
+    tally.add(check_cameras(source, labels))
+    sound, findings = check_poses(source, labels)
+    tally.add(findings)
+    tally.add(check_specs(source, labels, task.plans, sound))
+    labelling = check_canonical(source, labels, sound)
+    tally.add(labelling.findings)
+    annotations = match_annotations(source, labels)
+    tally.add(annotations.findings)
+    for im_id in labels.image_ids:
+        tally.add(ImageCheck(source, labels, im_id, annotations.by_image.get(im_id, {}), sound).run())
+    instances = sum(len(gt) for gt in labels.gt.values())
+    return SceneResult(task.scene_id, tally, tuple(labels.gt), instances, labelling.stale)
