@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -66,7 +67,8 @@ def validate(
     tally.add(findings)
     plans = plans_by_scene(source.recipe)
     tally.add(check_folders(root, source.recipe, list(plans)))
-    with _workers(workers, max(len(plans), -(-deep_images // _DEEP_IMAGES_PER_TASK) * deep)) as run:
+    n_deep_tasks = math.ceil(min(deep_images, source.recipe.images) / _DEEP_IMAGES_PER_TASK) if deep else 0
+    with _workers(workers, max(len(plans), n_deep_tasks)) as run:
         tasks = [SceneTask(source, scene_id, tuple(of_scene), limit) for scene_id, of_scene in plans.items()]
         scenes = list(run(check_scene, tasks, "validating"))
         for scene in scenes:
