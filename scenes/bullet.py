@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Self
@@ -39,7 +40,7 @@ class RigidWorld:
 
         self._bpy = bpy
         self._scale, self._margin = scale, margin_m * scale
-        self._friction, self._restitution = friction, restitution
+        self._friction, self._restitution = math.sqrt(friction), restitution  # Bullet multiplies both bodies' values
         self._damping = linear_damping, angular_damping
         self._bodies: list[Any] = []
         self._frame = 0  # the first frame of all only sets the simulation up
@@ -57,6 +58,7 @@ class RigidWorld:
         world.collection = self._collection
         world.substeps_per_frame = round(steps_per_second / _FRAMES_PER_SECOND)
         world.solver_iterations = iterations
+        world.use_split_impulse = True  # pushing apart what overlaps must not speed it up
         world.point_cache.frame_start, world.point_cache.frame_end = 1, _LAST_FRAME
 
     def __enter__(self) -> Self:
@@ -72,7 +74,7 @@ class RigidWorld:
         signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
         box = self._add(signs * half_size_m, "BOX")
         box.rigid_body.type = "PASSIVE"
-        box.rigid_body.friction = friction
+        box.rigid_body.friction = math.sqrt(friction)
         box.matrix_world = self._matrix(rotation, centre_m)
 
     def add_body(self, pieces_m: Sequence[Array], mass_kg: float, rotation: Array, position_m: Array) -> None:

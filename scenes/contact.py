@@ -16,8 +16,8 @@ from scenes.mesh import Mesh
 
 Array = NDArray[np.float64]
 
-SAMPLES_PER_SIDE = 160
-"""Surface samples along the longest side of a mesh: 1 mm apart on a part of 160 mm."""
+SAMPLES_PER_SIDE = 120
+"""Surface samples along the longest side of a mesh: 1 mm apart on a part of 120 mm."""
 
 _NEIGHBOURS = 6
 """Samples whose triangles are searched for the closest point."""
@@ -146,7 +146,9 @@ def _or_inf(distance: float, reach: float) -> float:
 
 
 def _inside_box(points: Array, low: Array, high: Array) -> Array:
-    return np.asarray(points[((points >= low) & (points <= high)).all(axis=1)])
+    for axis in range(3):  # one by one, since few are left after the first
+        points = points[(points[:, axis] >= low[axis]) & (points[:, axis] <= high[axis])]
+    return points
 
 
 def _depth(points_m: Array, other: Posed) -> float:

@@ -46,7 +46,8 @@ class PhysicsSettings:
         iterations: of the contact solver, per step.
         fall_s: longest time between the walls.
         rest_s: longest time without them.
-        still_m, still_s: at rest is when no point of any object moves further than this within this time.
+        still_m, still_s: at rest is when no point of any object moves further than this within this time. Bullet's
+            friction lets piles creep by a few mm/s; what topples or rolls is faster.
         crowding: the walls' radius, in units of the root of the objects' summed squared radii.
         table_radius_m: objects must come to rest within this distance of the origin.
         max_gap_m: to what carries an object.
@@ -54,20 +55,20 @@ class PhysicsSettings:
     """
 
     gravity_m_s2: float = 9.81
-    friction: float = 0.3
+    friction: float = 0.25
     restitution: float = 0.0
     linear_damping: float = 0.5
     angular_damping: float = 0.9
     density_kg_m3: float = 1000.0
-    scale: float = 20.0
+    scale: float = 100.0
     margin_m: float = 0.0002
     steps_per_second: int = 240
-    iterations: int = 10
+    iterations: int = 50
     fall_s: float = 2.0
     rest_s: float = 4.0
-    still_m: float = 0.0005
-    still_s: float = 0.25
-    crowding: float = 0.9
+    still_m: float = 0.003
+    still_s: float = 0.5
+    crowding: float = 0.7
     table_radius_m: float = 0.6
     max_gap_m: float = 0.001
     max_penetration_m: float = 0.001
