@@ -15,6 +15,7 @@ from generator.adopt import adopt
 from generator.config import load_recipe, settings
 from generator.doctor import examine, is_fit, to_json, to_text
 from generator.fetch import fetch
+from generator.formats.card import write_card
 from generator.formats.coco import export_coco
 from generator.formats.files import atomic_write, read_json
 from generator.formats.images import encode_png
@@ -26,6 +27,7 @@ from generator.replay import render_again
 from generator.review.preview import write_preview
 from generator.review.preview.pages import STATISTICS_FILE
 from generator.review.sheet import write_contact_sheet
+from generator.review.validate import validate
 from generator.studio import DropFailed
 from scenes.blender import BlenderError
 
@@ -171,6 +173,8 @@ def relabel_command(
 ) -> None:
     """Make the labels those of other symmetries; images stay. Without options: make all labels again."""
     done = relabel(dataset, symmetries, scheme, dry_run)
+    if not dry_run:
+        write_card(dataset)
     print(json.dumps(asdict(done)) if as_json else done)
 
 
@@ -210,6 +214,21 @@ def export_webdataset_command(
         return
     shards = export_webdataset(dataset, to, images_per_shard=images_per_shard, shuffle_seed=shuffle_seed)
     print(f"{len(shards)} images in {len(set(shards.values()))} shards in {to}")
+
+
+@app.command("validate")
+def validate_command(
+    dataset: Annotated[Path, typer.Argument(help="The dataset's folder.")],
+    deep: Annotated[bool, typer.Option("--deep", help="Also cast the rays of some images again.")] = False,
+    exports: Annotated[list[Path] | None, typer.Option("--export", help="A COCO file or shards made from it.")] = None,
+    limit: Annotated[int, typer.Option(min=1, help="How many faults of each kind to show.")] = 20,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> None:
+    """Check every file, every label, and both against each other."""
+    report = validate(dataset, deep, exports or (), limit)
+    print(json.dumps(report.to_json()) if as_json else "\n".join(report.lines()))
+    if not report.valid:
+        raise typer.Exit(EXIT_FAILED)
 
 
 @app.command("preview")

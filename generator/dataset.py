@@ -17,6 +17,7 @@ from generator.changes import complete
 from generator.config import Recipe, dump_recipe
 from generator.formats import bop
 from generator.formats.bop import Entry, ScenePaths
+from generator.formats.card import write_card
 from generator.formats.files import atomic_write, read_json, write_json, write_json_lines
 from generator.labels import label_scene
 from generator.locks import in_turn
@@ -64,14 +65,14 @@ class Dataset:
     recipe: Recipe
 
     @classmethod
-    def open(cls, root: Path, recipe: Recipe, models: Mapping[int, ObjectModel], photos_digest: str) -> Dataset:
+    def open(cls, root: Path, recipe: Recipe, models: Mapping[int, ObjectModel], scenery_digest: str) -> Dataset:
         """Begin a dataset, or go on with one that was made from the same recipe, models and photographs.
 
         Raises:
             ValueError: the folder holds something else, or cannot be written.
         """
         known = root / DATASET_FILE
-        header = _header(recipe, models, photos_digest)
+        header = _header(recipe, models, scenery_digest)
         if known.exists():
             before = read_json(known)
             _refuse_other(known, before, header)
@@ -119,7 +120,14 @@ class Dataset:
         with in_turn(self.root):
             self._assemble()
 
-    def _assemble(self) -> None:
+    def finish(self) -> None:
+        """Assemble, and describe the dataset in its card; errors as in ``assemble``."""
+        with in_turn(self.root):
+            if self._assemble():
+                write_card(self.root)
+
+    def _assemble(self) -> int:
+        """Do it, and return how many images there are."""
         complete(self.root)
         table = SymmetryTable.read(self.root / SYMMETRIES_FILE)
         header = read_json(self.root / DATASET_FILE)
@@ -135,6 +143,7 @@ class Dataset:
         header["counts"] = {"images": images, "instances": instances}
         header["symmetries"] = symmetries
         write_json(self.root / DATASET_FILE, header)
+        return images
 
     def _records(self, scene_id: int) -> Path:
         return self.root / RECORDS_FOLDER / f"{scene_id:06d}"
@@ -197,14 +206,14 @@ def describe_symmetries(table: SymmetryTable) -> Entry:
     return {"scheme": table.scheme, "sha256": table.digest()}
 
 
-def _header(recipe: Recipe, models: Mapping[int, ObjectModel], photos_digest: str) -> Entry:
+def _header(recipe: Recipe, models: Mapping[int, ObjectModel], scenery_digest: str) -> Entry:
     """What dataset.json says before the first image."""
     return {
         "name": recipe.name,
         "recipe": dump_recipe(recipe),
         "versions": {name: version(name) for name in ("synthetless", "bpy")},
         "models_sha256": {str(obj_id): model.digest for obj_id, model in models.items()},
-        "textures_digest": photos_digest,
+        "scenery_digest": scenery_digest,
         "licence": recipe.source.licence,
         "counts": {"images": 0, "instances": 0},
     }
@@ -224,7 +233,7 @@ def _refuse_foreign(root: Path) -> None:
 
 def _refuse_other(path: Path, before: Entry, now: Entry) -> None:
     """Continue only what would come out the same had it never been interrupted."""
-    for key in ("versions", "models_sha256", "textures_digest"):
+    for key in ("versions", "models_sha256", "scenery_digest"):
         if before.get(key) != now[key]:
             raise DatasetError(f"{path}: was begun with other {key} than now; use another output folder")
     old, new = _flat(before.get("recipe", {})), _flat(now["recipe"])

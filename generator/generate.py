@@ -74,15 +74,17 @@ def generate(recipe: Recipe, out: Path, execution: Execution) -> Summary:
     sources = load_sources(recipe)
     if not (out / DATASET_FILE).exists():
         check_photos(sources)
-    dataset = Dataset.open(out, recipe, sources.models, sources.photos_digest)
+    dataset = Dataset.open(out, recipe, sources.models, sources.scenery_digest)
     with locked(out, execution.part):
         missing = _wanted(dataset, execution.part)
         failures: list[Outcome] = []
         try:
             if missing:
                 failures = _make(dataset, sources, missing, execution)
-        finally:  # an interrupted dataset can be looked at, too
+        except BaseException:  # an interrupted dataset can be looked at, too
             dataset.assemble()
+            raise
+        dataset.finish()
     return _summarise(dataset, len(missing) - len(_wanted(dataset, execution.part)), failures)
 
 
@@ -111,7 +113,7 @@ def redo(out: Path, drop: int, textures: str | None = None) -> int:
     if textures is not None:
         recipe = recipe.model_copy(update={"source": recipe.source.model_copy(update={"textures": textures})})
     sources = load_sources(recipe)
-    dataset = Dataset.open(out, recipe, sources.models, sources.photos_digest)
+    dataset = Dataset.open(out, recipe, sources.models, sources.scenery_digest)
     views = recipe.camera.views_per_drop
     plans = [plan_image(number, views) for number in range(drop * views, min((drop + 1) * views, recipe.images))]
     if not plans:
@@ -120,7 +122,7 @@ def redo(out: Path, drop: int, textures: str | None = None) -> int:
         for image in Studio(recipe, sources).make(drop, plans):
             dataset.commit(image)
         (out / FAILURES_FOLDER / f"{drop:08d}.json").unlink(missing_ok=True)
-        dataset.assemble()
+        dataset.finish()
     return len(plans)
 
 

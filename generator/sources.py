@@ -45,12 +45,12 @@ class Sources:
         return Catalogue(diameters(self.models), diameters(self.distractors), self.photos)
 
     @property
-    def photos_digest(self) -> str:
-        """SHA-256 of the photographs' names and sizes, "" without photographs."""
-        if self.photos_folder is None:
-            return ""
-        listing = [f"{name} {(self.photos_folder / name).stat().st_size}\n" for name in self.photos]
-        return hashlib.sha256("".join(listing).encode()).hexdigest()
+    def scenery_digest(self) -> str:
+        """SHA-256 of what surrounds the models: names and sizes of the photographs, meshes of the distractors."""
+        listing = [f"distractor {obj_id} {model.digest}" for obj_id, model in self.distractors.items()]
+        if self.photos_folder is not None:
+            listing += [f"photo {name} {(self.photos_folder / name).stat().st_size}" for name in self.photos]
+        return hashlib.sha256("\n".join(listing).encode()).hexdigest()
 
 
 def load_sources(recipe: Recipe) -> Sources:

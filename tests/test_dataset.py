@@ -157,7 +157,7 @@ def test_other_models_or_photographs_are_refused(
     tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel]
 ) -> None:
     Dataset.open(tmp_path / "d", recipe, models, "")
-    with pytest.raises(DatasetError, match="textures_digest"):
+    with pytest.raises(DatasetError, match="scenery_digest"):
         Dataset.open(tmp_path / "d", recipe, models, "other")
     models[1].path.write_bytes(models[1].path.read_bytes() + b"\n")
     with pytest.raises(DatasetError, match="models_sha256"):

@@ -31,7 +31,7 @@ from generator.formats.scene import ImageLabels, read_scene
 MAX_IMAGES_PER_SHARD = 1000
 """BOP's limit."""
 KEYS_FILE = "key_to_shard.json"
-_COMPANIONS = ("dataset.json", "symmetries.json")
+_COMPANIONS = ("dataset.json", "symmetries.json", "README.md")
 """Files of the dataset folder that tell what the labels mean, copied beside the shards."""
 
 Members = dict[str, bytes]

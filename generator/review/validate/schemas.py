@@ -177,7 +177,7 @@ class Header(BaseModel):
     recipe: Recipe
     versions: dict[str, str]
     models_sha256: dict[int, str]
-    textures_digest: str
+    scenery_digest: str
     licence: str
     counts: Counts
     symmetries: SymmetriesDigest
