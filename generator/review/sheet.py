@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -34,7 +33,7 @@ def write_contact_sheet(dataset: Path, to: Path, split: str, limit: int = 6) -> 
         _with_labels(rgb, scene, int(path.stem), labels[int(path.stem)])
         for rgb, path in zip(plain, chosen, strict=True)
     ]
-    columns = math.ceil(math.sqrt(2 * len(chosen))) if len(chosen) > 3 else len(chosen)
+    columns = min(len(chosen), 3)
     rows = []
     for start in range(0, len(chosen), columns):
         rows += [_row(plain[start : start + columns], columns), _row(drawn[start : start + columns], columns)]
