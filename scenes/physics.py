@@ -55,7 +55,7 @@ class PhysicsSettings:
     """
 
     gravity_m_s2: float = 9.81
-    friction: float = 0.25
+    friction: float = 0.2
     restitution: float = 0.0
     linear_damping: float = 0.5
     angular_damping: float = 0.9
@@ -66,7 +66,7 @@ class PhysicsSettings:
     iterations: int = 50
     fall_s: float = 2.0
     rest_s: float = 4.0
-    still_m: float = 0.003
+    still_m: float = 0.004
     still_s: float = 0.5
     crowding: float = 0.7
     table_radius_m: float = 0.6
