@@ -127,7 +127,7 @@ def test_another_seed_changes_every_image(dataset: Path, recipe: Path, tmp_path:
 def test_ctrl_c_and_again_gives_the_same_bytes(dataset: Path, recipe: Path, tmp_path: Path) -> None:
     out = tmp_path / "d"
     process = subprocess.Popen(
-        _command(recipe, out, "--workers", "2"), cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True
+        _command(recipe, out, "--workers", "1"), cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
     deadline = time.monotonic() + 300
     while not list(out.glob(".records/*/*.json")) and time.monotonic() < deadline:
@@ -140,7 +140,7 @@ def test_ctrl_c_and_again_gives_the_same_bytes(dataset: Path, recipe: Path, tmp_
     assert "Traceback" not in stderr
     assert stderr.strip().splitlines()[-1] == "synthetless: interrupted; run the same command again to go on"
     made = len(bop.read_scene_json(ScenePaths.of(out, 1).scene_camera))
-    assert 1 <= made <= 6, "what is made can be looked at"
+    assert 1 <= made < 6, "what is made can be looked at"
     _generate(recipe, out)
     assert _tree(out) == _tree(dataset)
 
