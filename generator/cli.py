@@ -29,6 +29,9 @@ from generator.review.preview.pages import STATISTICS_FILE
 from generator.review.sheet import write_contact_sheet
 from generator.review.validate import validate
 from generator.studio import DropFailed
+from generator.symmetry.detection import detect_folder, report
+from generator.symmetry.detection.gallery import draw_detected, draw_table
+from generator.symmetry.detection.show import describe, read_table
 from scenes.blender import BlenderError
 
 SHEET_FILE = "preview.jpg"
@@ -43,6 +46,8 @@ app = typer.Typer(
 
 export = typer.Typer(help="Write the dataset in other formats.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(export, name="export")
+symmetries_app = typer.Typer(help="Symmetry groups of parts.", no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(symmetries_app, name="symmetries")
 
 TableOption = Annotated[Path | None, typer.Option(help="Symmetry table (YAML or JSON); it may name some objects only.")]
 SchemeOption = Annotated[
@@ -225,9 +230,9 @@ def validate_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Check every file, every label, and both against each other."""
-    report = validate(dataset, deep, exports or (), limit)
-    print(json.dumps(report.to_json()) if as_json else "\n".join(report.lines()))
-    if not report.valid:
+    found = validate(dataset, deep, exports or (), limit)
+    print(json.dumps(found.to_json()) if as_json else "\n".join(found.lines()))
+    if not found.valid:
         raise typer.Exit(EXIT_FAILED)
 
 
@@ -244,6 +249,41 @@ def preview_command(
     page = write_preview(dataset, to, split, images, workers)
     statistics = read_json(page.parent / STATISTICS_FILE)
     print(json.dumps({"page": str(page), "statistics": statistics}) if as_json else f"preview: {page}")
+
+
+@symmetries_app.command("detect")
+def detect_command(
+    models: Annotated[Path, typer.Argument(help="Folder of PLY, STL, OBJ or OFF files.")],
+    out: Annotated[Path | None, typer.Option(help="Symmetry table to write.")] = None,
+    models_out: Annotated[Path | None, typer.Option(help="BOP models folder to write, models_info.json too.")] = None,
+    tolerance_percent: Annotated[float, typer.Option(min=0, help="Largest residual, in % of the diameter.")] = 1.0,
+    scale: Annotated[float, typer.Option(min=0, help="Millimetres per unit of the files; 1000 for metres.")] = 1.0,
+    pictures: Annotated[Path | None, typer.Option(help="Folder for a picture of each part.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores if not given.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
+) -> None:
+    """Find each mesh's symmetry group, and what every other group would leave as residual."""
+    detected = detect_folder(models, tolerance_percent, scale, workers)
+    if out is not None:
+        detected.table().write(out)
+    if models_out is not None:
+        detected.write_models(models_out)
+    if pictures is not None:
+        draw_detected(detected, pictures, workers)
+    print(json.dumps(detected.to_json()) if as_json else report(detected))
+
+
+@symmetries_app.command("show")
+def show_command(
+    table: Annotated[Path, typer.Argument(help="Symmetry table, models_info.json, or a folder that holds one.")],
+    models: Annotated[Path | None, typer.Option(help="Folder of the meshes, for pictures.")] = None,
+    pictures: Annotated[Path | None, typer.Option(help="Folder for a picture of each part.")] = None,
+) -> None:
+    """Tell what a symmetry table means: regressors, margins, and which views are dangerous."""
+    read = read_table(table)
+    if pictures is not None:
+        draw_table(read, models or (table if table.is_dir() else table.parent), pictures)
+    print(describe(read))
 
 
 @app.command("doctor")

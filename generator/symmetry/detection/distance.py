@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,9 @@ from scipy.spatial import cKDTree
 from generator.symmetry.quaternions import Floats, normalise
 
 Indices = NDArray[np.int64]
+
+PIECE = 0.03
+"""A good length for a surface's pieces, as a share of the diameter."""
 
 _NEIGHBOURS = 8
 _BLOCK = 8192
@@ -38,7 +41,7 @@ class Surface:
         centroid: (3,) centre of the surface's area: every symmetry keeps it.
     """
 
-    def __init__(self, vertices: Floats, faces: NDArray[np.integer], piece: float) -> None:
+    def __init__(self, vertices: Floats, faces: NDArray[np.integer[Any]], piece: float) -> None:
         """Take vertices (V, 3) and faces (F, 3).
 
         Raises:
@@ -57,7 +60,7 @@ class Surface:
         pieces, self._parent = _cut(self.corners, piece)
         centres = pieces.mean(axis=1)
         self._radius = float(np.linalg.norm(pieces - centres[:, None], axis=2).max())
-        self._tree = cKDTree(centres)
+        self._tree = cKDTree(centres, leafsize=32, balanced_tree=False, compact_nodes=False)  # the fastest queries
 
     def distance(self, points: Floats) -> Floats:
         """Distances (N,) of points (N, 3): exact but where fine triangles crowd, and never too small."""
@@ -118,7 +121,9 @@ def _planar_form(corners: Floats) -> Floats:
     e1 = normalise(b - a)
     normal = normalise(np.cross(b - a, c - a))
     e2 = np.cross(normal, e1)
-    lengths = np.stack([np.sum((b - a) * e1, axis=1), np.sum((c - a) * e1, axis=1), np.sum((c - a) * e2, axis=1)], axis=1)
+    lengths = np.stack(
+        [np.sum((b - a) * e1, axis=1), np.sum((c - a) * e1, axis=1), np.sum((c - a) * e2, axis=1)], axis=1
+    )
     return np.concatenate([a, e1, e2, normal, lengths], axis=1)
 
 

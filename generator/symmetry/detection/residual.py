@@ -1,188 +1,176 @@
 """How far a mesh is from having a symmetry group.
 
 For a point p of the surface X and an element S of the group G the deviation is the distance from S p to X. As G holds
-the inverse of each of its elements, all deviations together are the two-sided distance between X and all its images.
+the inverse of each of its elements, all deviations together are the two-sided distances between X and all its images.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from generator.symmetry.detection.distance import Indices, Surface
+from generator.symmetry.detection.orbits import (
+    elements_along_orbits,
+    moved,
+    orbit_coordinates,
+    some_elements,
+    spread_elements,
+    turns_beside,
+)
 from generator.symmetry.groups import SymmetryGroup
-from generator.symmetry.quaternions import Floats, from_axis_angle, minimal, multiply, normalise, rotate, to_matrix
+from generator.symmetry.quaternions import Floats, multiply
 
-_SAMPLES = 160_000  # points that the maximum is searched among; every 8th takes part from the start
+_DENSE = 160_000  # points that the maximum is searched among; every 8th takes part from the start
 _STRIDE = 8
-_QUICK_PAIRS = 12_000
-_STEP = 5e-3  # along the circles of a continuous group, as a share of the diameter
-_CELL = 2.5e-3  # orbits this near to each other are judged by one of them
-_LARGE = 60_000  # pairs that are judged even when the group is out of the question
-_SEEDS = 48  # pairs from which the maximum is searched further
-_EXACT = 400
+_THIN = 3e-3  # vertices nearer than this, as a share of the diameter, count as one at the start
+_FINENESS = 4e-3  # of orbits, and of steps along those of a continuous group, as a share of the diameter
+_FEW_PAIRS, _HOPELESS_PAIRS, _MOST_PAIRS = 6_000, 15_000, 200_000
+_BAD_POINTS, _ELEMENTS_OF_BAD = 300, 40
+_SEEDS = 40  # of the search for the maximum
+_REACHES = (2e-2, 1e-2, 5e-3)  # of that search, as shares of the diameter
 
 
 @dataclass(frozen=True)
 class Residual:
-    """Deviations over all elements but the identity: the largest over the whole surface, and by area the 95th
-    percentile and the root mean square, mm."""
+    """Deviations over all elements but the identity, mm.
+
+    Attributes:
+        max_mm: the largest over the whole surface.
+        p95_mm: the 95th percentile, by area.
+        rms_mm: the root mean square, by area.
+        worst_mm: the surface point that deviates most, model frame.
+    """
 
     max_mm: float
     p95_mm: float
     rms_mm: float
+    worst_mm: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Points, by number, and elements that move them, (N,) and (N, 4) wxyz, with the area weights (N,) of the pairs."""
+    """Points, by number (N,), the elements (N, 4) that move them, and the areas (N,) that they stand for."""
 
-    index: Indices
+    point: Indices
     element: Floats
     weight: Floats
+
+    def joined(self, other: _Pairs) -> _Pairs:
+        point, element = np.concatenate([self.point, other.point]), np.concatenate([self.element, other.element])
+        return _Pairs(point, element, np.concatenate([self.weight, other.weight]))
 
 
 class Meter:
     """Measures the residuals of groups on one mesh.
 
     Attributes:
-        surface: the mesh.
-        diameter_mm: its largest extent: what accuracy is relative to.
-        points: (P, 3) vertices and evenly spread samples, of which those before `n_samples` are the latter.
+        diameter_mm: the largest distance in the mesh; lengths are judged by it.
+        dense: (D, 3) evenly spread surface points, then all vertices.
     """
 
     def __init__(self, surface: Surface, vertices_mm: Floats, diameter_mm: float) -> None:
-        self.surface, self.diameter_mm = surface, diameter_mm
-        self._dense = surface.sampled(_SAMPLES)
-        self._dense_tree = cKDTree(self._dense)
-        samples = self._dense[::_STRIDE]
-        self.n_samples = len(samples)
-        self.points: Floats = np.concatenate([samples, np.unique(vertices_mm, axis=0)])
+        self._surface, self.diameter_mm = surface, diameter_mm
+        samples = surface.sampled(_DENSE)
+        self.dense: Floats = np.concatenate([samples, vertices_mm])
+        self._dense_tree = cKDTree(self.dense)
+        self._n_samples = len(samples[::_STRIDE])
+        self._points = np.concatenate([samples[::_STRIDE], _thinned(vertices_mm, _THIN * diameter_mm)])
 
     def measure(self, group: SymmetryGroup, enough_mm: float) -> Residual:
-        """The residual of a group; where it exceeds `enough_mm` by far, percentiles from fewer points."""
+        """The residual of a group; from fewer pairs where it exceeds `enough_mm` anyway."""
         if group.name == "C1":
             return Residual(0.0, 0.0, 0.0)
-        pairs = self._some_pairs(group, _QUICK_PAIRS)
-        found = self._deviations(group, pairs)
-        if found.max() <= 2 * enough_mm:
-            pairs = self._all_pairs(group)
+        glance = self.glance(group)
+        if glance > enough_mm:
+            pairs = self._some_pairs(group, _HOPELESS_PAIRS if glance > 5 * enough_mm else len(self._points))
+            found = self._deviations(group, pairs)
+            worse = self._pairs_of_bad_points(group, pairs, found)
+            pairs, found = worse.joined(pairs), np.concatenate([self._deviations(group, worse), found])
         else:
-            pairs = self._some_pairs(group, _LARGE)
-        found = self._deviations(group, pairs)
-        return Residual(self._maximum(group, pairs, found), *_statistics(found, pairs.weight))
+            pairs = self._all_pairs(group)
+            found = self._deviations(group, pairs)
+        largest, worst = self._maximum(group, pairs, found)
+        p95, rms = _statistics(np.minimum(found, largest), pairs.weight)
+        return Residual(largest, p95, rms, worst)
+
+    def glance(self, group: SymmetryGroup) -> float:
+        """The largest deviation among few pairs, mm."""
+        pairs = self._some_pairs(group, _FEW_PAIRS)
+        places = moved(group, self._points[pairs.point], pairs.element)
+        return float(self._settled(self._surface.distance(places), places).max())
 
     def _deviations(self, group: SymmetryGroup, pairs: _Pairs) -> Floats:
-        return self.surface.distance(_moved(group, self.points[pairs.index], pairs.element))
+        return self._surface.distance(moved(group, self._points[pairs.point], pairs.element))
 
     def _some_pairs(self, group: SymmetryGroup, n: int) -> _Pairs:
-        """About n pairs: evenly chosen points, each with all elements of a finite group or with a few."""
-        elements = _nontrivial(group) if group.is_finite else group.sampled_wxyz(24)[1:]
-        stride = max(1, len(self.points) * len(elements) // n)
-        index = np.arange(0, len(self.points), stride)
-        weight = (index < self.n_samples).astype(np.float64)
-        return _Pairs(np.repeat(index, len(elements)), np.tile(elements, (len(index), 1)), np.repeat(weight, len(elements)))
+        """n pairs of evenly chosen points, each with an element of its own."""
+        point = np.arange(n) * len(self._points) // n
+        return _Pairs(point, spread_elements(group, n), (point < self._n_samples).astype(np.float64))
+
+    def _pairs_of_bad_points(self, group: SymmetryGroup, pairs: _Pairs, found: Floats) -> _Pairs:
+        """The points that deviate most, with more elements."""
+        bad = pairs.point[np.argsort(found)[-_BAD_POINTS:]]
+        elements = some_elements(group, _ELEMENTS_OF_BAD)
+        n = len(bad) * len(elements)
+        return _Pairs(np.repeat(bad, len(elements)), np.tile(elements, (len(bad), 1)), np.zeros(n))
 
     def _all_pairs(self, group: SymmetryGroup) -> _Pairs:
-        """One point of every orbit, with all elements of a finite group, or with elements as dense as `_STEP`."""
-        index, weight = self._orbits(group)
-        if group.is_finite:
-            elements = _nontrivial(group)
-            n = len(elements)
-            return _Pairs(np.repeat(index, n), np.tile(elements, (len(index), 1)), np.repeat(weight, n))
-        counts, elements = _dense_elements(group, self.points[index], _STEP * self.diameter_mm)
-        return _Pairs(np.repeat(index, counts), elements, np.repeat(weight / counts, counts))
+        """One point of every orbit, with elements all along it."""
+        fineness = _FINENESS * self.diameter_mm
+        while True:
+            point, weight = self._orbits(group, fineness)
+            counts, elements = elements_along_orbits(group, self._points[point], fineness)
+            if len(elements) <= _MOST_PAIRS:
+                return _Pairs(np.repeat(point, counts), elements, np.repeat(weight / counts, counts))
+            fineness *= 1.4
 
-    def _orbits(self, group: SymmetryGroup) -> tuple[Indices, Floats]:
-        """The number of one point of each orbit of the group, and how many samples lie on it."""
-        places = _in_fundamental_domain(group, self.points - np.array(group.offset_mm))
-        cells = np.floor(places / (_CELL * self.diameter_mm)).astype(np.int64)
+    def _orbits(self, group: SymmetryGroup, fineness_mm: float) -> tuple[Indices, Floats]:
+        """A point, by number, of every orbit that is farther than this from the others, and the samples near it."""
+        cells = np.floor(orbit_coordinates(group, self._points) / fineness_mm).astype(np.int64)
         _, first, cell = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-        counts = np.bincount(cell.ravel()[: self.n_samples], minlength=len(first))
-        return first, counts.astype(np.float64)
+        return first, np.bincount(cell.ravel()[: self._n_samples], minlength=len(first)).astype(np.float64)
 
-    def _maximum(self, group: SymmetryGroup, pairs: _Pairs, found: Floats) -> float:
-        """The largest deviation: from the worst pairs on to the points and elements beside them, exactly."""
-        worst = np.argsort(found)[::-1][:_SEEDS]
-        seeds, elements = self.points[pairs.index[worst]], pairs.element[worst]
-        near = self._dense_tree.query_ball_point(seeds, 1e-2 * self.diameter_mm)
-        counts = np.array([len(n) for n in near])
-        beside = self._dense[np.concatenate(near).astype(np.int64)] if counts.any() else self._dense[:0]
-        points = [self.points[pairs.index], beside]
-        turns = [pairs.element, np.repeat(elements, counts, axis=0)]
-        if not group.is_finite:
-            steps = _small_turns(group, _STEP)
-            points.append(np.repeat(seeds, len(steps), axis=0))
-            turns.append(multiply(steps[None], elements[:, None]).reshape(-1, 4))
-        images = [_moved(group, p, q) for p, q in zip(points, turns, strict=True)]
-        places = np.concatenate(images)
-        distances = np.concatenate([found, self.surface.distance(np.concatenate(images[1:]))])
-        order = np.argsort(distances)[::-1][:_EXACT]
+    def _maximum(self, group: SymmetryGroup, pairs: _Pairs, found: Floats) -> tuple[float, tuple[float, float, float]]:
+        """The largest deviation, exactly, and its point: of the pairs, then of what is ever nearer to the worst."""
+        points, elements = self._points[pairs.point], pairs.element
+        places = moved(group, points, elements)
+        for share in _REACHES:
+            found = self._settled(found, places)
+            worst = np.argpartition(found, -min(_SEEDS, len(found)))[-_SEEDS:]
+            near = self._dense_tree.query_ball_point(points[worst], share * self.diameter_mm)
+            counts = [len(numbers) for numbers in near]
+            turns = turns_beside(group, 2 * share)
+            n = len(turns)
+            turned = multiply(turns, elements[worst, None]).reshape(-1, 4)
+            elements = np.concatenate([elements[worst], np.repeat(elements[worst], counts, axis=0), turned])
+            beside = self.dense[np.concatenate(near).astype(np.int64)]
+            points = np.concatenate([points[worst], beside, np.repeat(points[worst], n, axis=0)])
+            places = moved(group, points, elements)
+            found = np.concatenate([found[worst], self._surface.distance(places[len(worst) :])])
+        found = self._settled(found, places)
+        worst_of_all = int(np.argmax(found))
+        x, y, z = points[worst_of_all].tolist()
+        return float(found[worst_of_all]), (x, y, z)
+
+    def _settled(self, distances: Floats, places: Floats) -> Floats:
+        """The distances (N,) of places (N, 3), the largest ones made exact until the largest is certain."""
+        settled = distances.copy()
         best = 0.0
-        for i in order:
+        for i in np.argsort(distances)[::-1]:
             if distances[i] <= best:
                 break
-            best = max(best, float(self.surface.exact(places[i : i + 1], distances[i : i + 1])[0]))
-        return best
+            settled[i] = self._surface.exact(places[[i]], distances[[i]])[0]
+            best = max(best, float(settled[i]))
+        return settled
 
 
-def _nontrivial(group: SymmetryGroup) -> Floats:
-    return np.asarray(group.elements_wxyz[1:])
-
-
-def _moved(group: SymmetryGroup, points: Floats, elements: Floats) -> Floats:
-    offset = np.array(group.offset_mm)
-    return np.einsum("nij,nj->ni", to_matrix(elements), points - offset) + offset
-
-
-def _in_fundamental_domain(group: SymmetryGroup, points: Floats) -> Floats:
-    """Coordinates that are the same for all points of an orbit."""
-    if group.family == "SO(3)":
-        return np.linalg.norm(points, axis=1, keepdims=True)
-    if not group.is_finite:
-        along = points @ np.array(group.axis)
-        across = np.linalg.norm(points - along[:, None] * np.array(group.axis), axis=1)
-        return np.stack([across, np.abs(along) if group.family == "O(2)" else along], axis=1)
-    towards = rotate(group.frame_wxyz, normalise([0.53, 0.29, 0.8]))
-    matrices = to_matrix(group.elements_wxyz)
-    chosen = matrices[np.argmax(points @ (towards @ matrices).T, axis=1)]
-    return np.einsum("nij,nj->ni", chosen, points)
-
-
-def _dense_elements(group: SymmetryGroup, points: Floats, step_mm: float) -> tuple[Indices, Floats]:
-    """For each point (N, 3) how many elements move it in steps of about `step_mm` over its orbit, and all of them."""
-    local = points - np.array(group.offset_mm)
-    if group.family == "SO(3)":
-        radii = np.linalg.norm(local, axis=1)
-        counts = np.clip(4 * np.pi * radii**2 / (2 * step_mm) ** 2, 24, 4000).astype(np.int64)
-        spheres = [minimal(normalise(p), _fibonacci(n)) for p, n in zip(local, counts, strict=True)]
-        return counts, np.concatenate(spheres)
-    axis = np.array(group.axis)
-    radii = np.linalg.norm(np.cross(axis, local), axis=1)
-    turns = np.clip(np.ceil(2 * np.pi * radii / step_mm), 12, 720).astype(np.int64)
-    discrete = group.sampled_wxyz(1)
-    counts = turns * len(discrete)
-    angles = np.concatenate([np.arange(k * len(discrete)) // len(discrete) * (2 * np.pi / k) for k in turns])
-    flips = discrete[np.concatenate([np.arange(n) % len(discrete) for n in counts])]
-    return counts, multiply(from_axis_angle(axis, angles), flips)
-
-
-def _small_turns(group: SymmetryGroup, step: float) -> Floats:
-    """Turns of a continuous group by less than a step, whose length on the rim is a share `step` of the diameter."""
-    angles = 2 * step * np.linspace(-1, 1, 9)
-    axes = np.eye(3) if group.axis is None else np.array([group.axis])
-    return np.concatenate([from_axis_angle(axis, angles) for axis in axes])
-
-
-def _fibonacci(n: int) -> Floats:
-    """n directions (n, 3) spread evenly over the sphere."""
-    i = np.arange(n) + 0.5
-    z, angle = 1 - 2 * i / n, np.pi * (1 + np.sqrt(5)) * i
-    across = np.sqrt(1 - z**2)
-    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
+def _thinned(points: Floats, distance_mm: float) -> Floats:
+    """One of the points (N, 3) of every cell of a grid."""
+    _, first = np.unique(np.floor(points / distance_mm).astype(np.int64), axis=0, return_index=True)
+    return points[first]
 
 
 def _statistics(deviations: Floats, weights: Floats) -> tuple[float, float]:

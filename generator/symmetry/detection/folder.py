@@ -1,0 +1,238 @@
+"""Detection on a folder of meshes, several at a time, and what is written of it."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import trimesh
+from tqdm import tqdm
+
+from generator.formats.files import atomic_write, read_json, write_json
+from generator.symmetry.atlas import SCHEMES, Scheme
+from generator.symmetry.detection.detect import Detected, Finding, detect
+from generator.symmetry.detection.meshes import find_meshes, read_mesh, unit_warning
+from generator.symmetry.groups import SymmetryGroup
+from generator.symmetry.table import SymmetryEntry, SymmetryTable
+
+INFO_FILE = "models_info.json"
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class DetectedObject:
+    """What was found on one object.
+
+    Attributes:
+        obj_id: BOP id.
+        path: its mesh.
+        info: BOP's diameter, min_ and size_, mm.
+        detected: its groups and their residuals.
+    """
+
+    obj_id: int
+    path: Path
+    info: Mapping[str, float]
+    detected: Detected
+
+    @property
+    def warning(self) -> str | None:
+        """What is odd about its size, if anything."""
+        return unit_warning(self.detected.diameter_mm)
+
+
+@dataclass(frozen=True)
+class DetectedFolder:
+    """What was found on a folder of meshes.
+
+    Attributes:
+        folder: where they are.
+        objects: by rising id.
+        are_numbered: whether the ids are only the files' places in alphabetical order.
+        tolerance_percent: what the largest residual may be, as a share of the diameter.
+        scale: what the files' coordinates were multiplied by to get millimetres.
+    """
+
+    folder: Path
+    objects: tuple[DetectedObject, ...]
+    are_numbered: bool
+    tolerance_percent: float
+    scale: float
+
+    def table(self, scheme: Scheme = SCHEMES[0]) -> SymmetryTable:
+        """The detected groups as a symmetry table."""
+        return SymmetryTable({o.obj_id: SymmetryEntry(o.detected.answer.group) for o in self.objects}, scheme)
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything, as plain dicts, lists and numbers."""
+        return {
+            "folder": str(self.folder),
+            "tolerance_percent": self.tolerance_percent,
+            "scale": self.scale,
+            "objects": [_object_json(o) for o in self.objects],
+        }
+
+    def write_models(self, to: Path) -> None:
+        """Make a BOP models folder: `obj_%06d.ply`, in millimetres, and `models_info.json` with the detected groups.
+
+        A PLY file that is already there under its name stays as it is.
+
+        Raises:
+            ValueError: a file cannot be written, or the folder holds other meshes.
+        """
+        targets = {to / f"obj_{o.obj_id:06d}.ply": o for o in self.objects}
+        for target, o in targets.items():
+            stays = target.exists() and target.samefile(o.path) and self.scale == 1
+            if not stays and (target.exists() or to.resolve() == self.folder.resolve()):
+                raise ValueError(f"{target}: would stand beside other meshes; give a new folder")
+        for target, o in targets.items():
+            if not target.exists():
+                atomic_write(target, self._ply(o))
+        write_json(to / INFO_FILE, {str(o.obj_id): _models_info(o) for o in self.objects})
+
+    def _ply(self, o: DetectedObject) -> bytes:
+        if o.path.suffix.lower() == ".ply" and self.scale == 1:
+            return o.path.read_bytes()
+        mesh = read_mesh(o.path, self.scale)
+        data: Any = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False).export(file_type="ply")
+        return bytes(data)
+
+
+def detect_folder(
+    folder: Path,
+    tolerance_percent: float = 1.0,
+    scale: float = 1.0,
+    workers: int | None = None,
+) -> DetectedFolder:
+    """Detect the symmetry group of every mesh in a folder.
+
+    Groups that a `models_info.json` in it declares are measured as well.
+
+    Args:
+        folder: holds PLY, STL, OBJ or OFF files.
+        tolerance_percent: what the largest residual may be, as a share of the diameter.
+        scale: what the files' coordinates are to be multiplied by to give millimetres.
+        workers: processes; one per available core if None. They are spawned: a script that calls this needs
+            ``if __name__ == "__main__"``.
+
+    Raises:
+        ValueError: wrong numbers, a folder without meshes, a mesh that is unusable; with the file's name.
+    """
+    for name, value in (("tolerance_percent", tolerance_percent), ("scale", scale)):
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"{name} is {value}; a number above 0 is needed")
+    files = find_meshes(folder)
+    declared = _declared(folder)
+    tasks = [
+        _Task(obj_id, path, tolerance_percent, scale, declared.get(obj_id)) for obj_id, path in files.paths.items()
+    ]
+    tasks.sort(key=lambda task: -task.path.stat().st_size)  # the longest first, so that no core ends up alone
+    objects = sorted(in_parallel(_detect_file, tasks, workers, "symmetries"), key=lambda o: o.obj_id)
+    return DetectedFolder(folder, tuple(objects), files.are_numbered, tolerance_percent, scale)
+
+
+def in_parallel(
+    function: Callable[[Task], Result], tasks: Iterable[Task], workers: int | None, description: str
+) -> Iterator[Result]:
+    """The function's results in the order in which they are done, with a progress bar."""
+    pending = list(tasks)
+    processes = min(workers or len(os.sched_getaffinity(0)), len(pending))
+    with tqdm(total=len(pending), desc=description, unit="mesh", disable=None) as bar:
+        if processes <= 1:
+            for task in pending:
+                yield function(task)
+                bar.update()
+            return
+        with ProcessPoolExecutor(processes, get_context("spawn"), initializer=_ignore_interrupt) as pool:
+            futures = [pool.submit(function, task) for task in pending]
+            try:
+                for future in as_completed(futures):
+                    yield future.result()
+                    bar.update()
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+
+
+@dataclass(frozen=True)
+class _Task:
+    obj_id: int
+    path: Path
+    tolerance_percent: float
+    scale: float
+    declared: SymmetryGroup | None
+
+
+def _ignore_interrupt() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent's affair
+
+
+def _detect_file(task: _Task) -> DetectedObject:
+    mesh = read_mesh(task.path, task.scale)
+    try:
+        detected = detect(mesh.vertices_mm, mesh.faces, mesh.diameter_mm, task.tolerance_percent, task.declared)
+    except ValueError as error:
+        raise ValueError(f"{task.path}: {error}") from error
+    return DetectedObject(task.obj_id, task.path, mesh.info(), detected)
+
+
+def _declared(folder: Path) -> dict[int, SymmetryGroup]:
+    path = folder / INFO_FILE
+    if not path.exists():
+        return {}
+    try:
+        table = SymmetryTable.from_models_info(read_json(path))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}" if str(path) not in str(error) else str(error)) from error
+    return {obj_id: entry.group for obj_id, entry in table.entries.items()}
+
+
+def _models_info(o: DetectedObject) -> dict[str, Any]:
+    return dict(o.info) | o.detected.answer.group.to_bop()
+
+
+def _object_json(o: DetectedObject) -> dict[str, Any]:
+    found = o.detected
+    group = found.answer.group
+    return {
+        "obj_id": o.obj_id,
+        "file": o.path.name,
+        **_group_json(group),
+        "diameter_mm": found.diameter_mm,
+        "tolerance_mm": found.tolerance_mm,
+        "warning": o.warning,
+        "residuals": [_finding_json(f, found) for f in found.findings],
+    }
+
+
+def _finding_json(finding: Finding, found: Detected) -> dict[str, Any]:
+    residual = finding.residual
+    return {
+        **_group_json(finding.group),
+        "max_mm": residual.max_mm,
+        "p95_mm": residual.p95_mm,
+        "rms_mm": residual.rms_mm,
+        "worst_mm": None if residual.worst_mm is None else list(residual.worst_mm),
+        "max_percent": 100 * residual.max_mm / found.diameter_mm,
+        "is_answer": finding == found.answer,
+        "is_next_larger": finding == found.next_larger,
+        "is_declared": finding == found.declared,
+    }
+
+
+def _group_json(group: SymmetryGroup) -> dict[str, Any]:
+    return {
+        "group": group.name,
+        "axis": None if group.axis is None else list(group.axis),
+        "secondary_axis": None if group.secondary_axis is None else list(group.secondary_axis),
+        "offset_mm": list(group.offset_mm),
+    }

@@ -1,0 +1,239 @@
+"""A picture of a part: coloured by how far a group's elements move its surface, with the group's axes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from generator.annotation import PosedModel
+from generator.formats.files import atomic_write
+from generator.formats.images import encode_png
+from generator.raycast import RayCaster
+from generator.symmetry.detection.detect import Finding
+from generator.symmetry.detection.distance import PIECE, Surface
+from generator.symmetry.detection.meshes import Mesh
+from generator.symmetry.detection.orbits import moved, spread_elements
+from generator.symmetry.detection.report import group_cells
+from generator.symmetry.groups import SymmetryGroup
+from generator.symmetry.quaternions import Floats, normalise
+from scenes.spec import Intrinsics
+
+Image = NDArray[np.uint8]
+Colour = tuple[int, int, int]
+
+_TILE_PX, _HEAD_PX, _LEGEND_PX = 400, 34, 120
+_MARGIN_PX = 24
+_DISTANCE = 6.0  # of the camera, in diameters
+_DIRECTIONS = ((1.0, -1.4, 0.8), (-1.0, 0.9, -0.7), (0.25, -0.3, 1.0))  # from the part to the camera, z up
+_SAMPLES, _IMAGES = 8000, 16
+_NEIGHBOURS = 3
+_INK, _GREY = (40, 40, 40), (190, 190, 190)
+_AXIS_COLOURS = {2: (30, 90, 220), 3: (20, 150, 60), 4: (200, 40, 160), 5: (220, 120, 0)}
+_MAIN_AXIS = (210, 20, 20)
+_DASHES = 120
+
+
+def picture(title: str, mesh: Mesh, findings: Sequence[Finding], tolerance_mm: float) -> Image:
+    """One row of views per finding: (H, W, 3) RGB.
+
+    The colour of a surface point is its largest deviation over (at most 16, evenly chosen) elements of the group; a
+    ring marks the point that deviates most, be it visible or not.
+    """
+    views = _Views(mesh)
+    rows = [views.row(finding, f"{title}   " if i == 0 else "", tolerance_mm) for i, finding in enumerate(findings)]
+    return np.concatenate(rows)
+
+
+def write_picture(path: Path, image: Image) -> None:
+    """Write a picture as PNG.
+
+    Raises:
+        ValueError: the file cannot be written.
+    """
+    atomic_write(path, encode_png(image))
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """A view of a part: a pinhole, rotation (3, 3) and translation (3,) mm, model to camera."""
+
+    pinhole: Intrinsics
+    R: Floats
+    t: Floats
+
+    def project(self, points: Floats) -> tuple[Floats, Floats]:
+        """Pixels (N, 2) and depths (N,) of points (N, 3) of the model frame."""
+        seen = points @ self.R.T + self.t
+        return self.pinhole.fx * seen[:, :2] / seen[:, 2:] + [self.pinhole.cx, self.pinhole.cy], seen[:, 2]
+
+
+class _Pen(NamedTuple):
+    colour: Colour
+    width: int = 1
+
+
+class _Axis(NamedTuple):
+    direction: Floats
+    text: str
+    pen: _Pen
+
+
+class _Views:
+    def __init__(self, mesh: Mesh) -> None:
+        low, high = mesh.vertices_mm.min(axis=0), mesh.vertices_mm.max(axis=0)
+        self._center, self._diameter = (low + high) / 2, mesh.diameter_mm
+        self._cameras = [_camera(mesh, -normalise(d), self._center) for d in _DIRECTIONS]
+        self._surface = Surface(mesh.vertices_mm, mesh.faces, PIECE * mesh.diameter_mm)
+        self._samples = self._surface.sampled(_SAMPLES)
+        self._tree = cKDTree(self._samples)
+        caster = RayCaster({0: (mesh.vertices_mm, mesh.faces)})
+        self._seen = [
+            caster.annotate(c.pinhole, None, [PosedModel(0, c.R, c.t)], normals=True, object_coordinates=True)
+            for c in self._cameras
+        ]
+
+    def row(self, finding: Finding, title: str, tolerance_mm: float) -> Image:
+        deviations = self._deviations(finding.group)
+        top = max(finding.residual.max_mm, tolerance_mm)
+        axes = _axes_of(finding.group)
+        tiles = [self._tile(i, deviations / top, finding, axes) for i in range(len(self._cameras))]
+        body = np.concatenate([*tiles, _legend(top, tolerance_mm, axes)], axis=1)
+        head = np.full((_HEAD_PX, body.shape[1], 3), 255, np.uint8)
+        name, axis, offset = group_cells(finding.group)
+        place = "" if name == "C1" else f"   axis {axis}   fixed point {offset}"
+        share = 100 * finding.residual.max_mm / self._diameter
+        _write(
+            head, f"{title}{name}{place}   largest residual {finding.residual.max_mm:.3f} mm ({share:.2f} %)", (10, 23)
+        )
+        return np.concatenate([head, body])
+
+    def _deviations(self, group: SymmetryGroup) -> Floats:
+        """The largest deviation of each sample (N,), mm."""
+        if group.name == "C1":
+            return np.zeros(len(self._samples))
+        elements = spread_elements(group, _IMAGES)
+        found = [
+            self._surface.distance(moved(group, self._samples, np.tile(element, (len(self._samples), 1))))
+            for element in np.unique(elements, axis=0)
+        ]
+        return np.asarray(np.max(found, axis=0))
+
+    def _tile(self, i: int, shares: Floats, finding: Finding, axes: Sequence[_Axis]) -> Image:
+        camera, seen = self._cameras[i], self._seen[i]
+        image = np.full((_TILE_PX, _TILE_PX, 3), 255, np.uint8)
+        on_part = seen.instance_ids >= 0
+        assert seen.object_coordinates_mm is not None and seen.normals is not None
+        _, nearest = self._tree.query(seen.object_coordinates_mm[on_part], k=_NEIGHBOURS)
+        colours = _colours(shares[nearest].mean(axis=1))
+        shading = 0.45 + 0.55 * np.clip(seen.normals[on_part] @ normalise([-0.4, -0.6, -1.0]), 0, 1)
+        image[on_part] = np.clip(colours * shading[:, None], 0, 255)
+        depth = np.where(on_part, seen.depth_mm, np.inf)
+        for axis in reversed(axes):
+            self._draw_axis(image, camera, depth, np.array(finding.group.offset_mm), axis)
+        if finding.residual.worst_mm is not None:
+            _mark(image, camera, np.array(finding.residual.worst_mm))
+        _draw_frame(image, camera.R)
+        return image
+
+    def _draw_axis(self, image: Image, camera: _Camera, depth: Floats, through: Floats, axis: _Axis) -> None:
+        """A line through the part: whole in front of it, dashed behind its surface."""
+        u = axis.direction
+        middle = through + u * float((self._center - through) @ u)
+        points = middle + np.linspace(-0.62, 0.62, _DASHES)[:, None] * self._diameter * u
+        pixels, depths = camera.project(points)
+        columns, rows = np.clip(np.rint(pixels).astype(int), 0, _TILE_PX - 1).T
+        drawn = (depths <= depth[rows, columns]) | (np.arange(_DASHES) % 6 < 3)
+        ends = np.flatnonzero(np.diff(np.concatenate([[False], drawn, [False]])))
+        for first, last in zip(ends[::2], ends[1::2] - 1, strict=True):
+            _line(image, pixels[first], pixels[last], axis.pen)
+
+
+def _camera(mesh: Mesh, forward: Floats, center: Floats) -> _Camera:
+    """A camera that looks along `forward`, z up, and sees the whole part in the middle of the tile."""
+    right = normalise(np.cross(forward, [0.0, 0.0, 1.0]))
+    R = np.stack([right, np.cross(forward, right), forward])
+    t = np.array([0, 0, _DISTANCE * mesh.diameter_mm]) - R @ center
+    seen = mesh.vertices_mm @ R.T + t
+    flat = seen[:, :2] / seen[:, 2:]
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    focal = (_TILE_PX - 2 * _MARGIN_PX) / float((high - low).max())
+    cx, cy = _TILE_PX / 2 - focal * (low + high) / 2
+    return _Camera(Intrinsics(_TILE_PX, _TILE_PX, focal, focal, float(cx), float(cy)), R, t)
+
+
+def _axes_of(group: SymmetryGroup) -> list[_Axis]:
+    """The axes of a group, the main one first; only that of a continuous group."""
+    if group.axis is None:
+        return []
+    main = np.array(group.axis)
+    if not group.is_finite:
+        return [_Axis(main, "axis", _Pen(_MAIN_AXIS, 2))]
+    directions: list[Floats] = [main]
+    counts = [1]
+    for axis in normalise(group.elements_wxyz[1:, 1:]):
+        parallel = np.abs(np.stack(directions) @ axis) > 0.999
+        if parallel.any():
+            counts[int(np.argmax(parallel))] += 1
+        else:
+            directions.append(axis)
+            counts.append(2)
+    others = [_Axis(d, f"{n}-fold", _Pen(_AXIS_COLOURS[n])) for d, n in zip(directions[1:], counts[1:], strict=True)]
+    return [_Axis(main, f"{counts[0]}-fold, main", _Pen(_MAIN_AXIS, 2)), *others]
+
+
+def _colours(shares: Floats) -> Floats:
+    """Pale grey for 0, then yellow to red for 1: (N, 3) RGB, 0 to 255."""
+    stops = np.array([[205, 208, 212], [255, 214, 90], [246, 120, 40], [190, 10, 40]], dtype=np.float64)
+    places = np.linspace(0, 1, len(stops))
+    return np.stack([np.interp(shares, places, stops[:, k]) for k in range(3)], axis=1)
+
+
+def _legend(top_mm: float, tolerance_mm: float, axes: Sequence[_Axis]) -> Image:
+    """The colour scale in mm, with a mark at the tolerance, and what the axes' colours mean."""
+    image = np.full((_TILE_PX, _LEGEND_PX, 3), 255, np.uint8)
+    high, low = 40, 250
+    image[high:low, 12:32] = _colours(np.linspace(1, 0, low - high))[:, None]
+    cv2.rectangle(image, (12, high), (31, low), _GREY, 1)
+    for share in (0.0, 0.5, 1.0):
+        _write(image, f"{share * top_mm:.3g}", (44, round(low - share * (low - high)) + 4))
+    _write(image, "mm", (12, high - 12))
+    y = round(low - min(tolerance_mm / top_mm, 1) * (low - high))
+    cv2.line(image, (6, y), (37, y), _INK, 1)
+    _write(image, "- tolerance", (12, low + 24))
+    cv2.circle(image, (16, low + 38), 5, _INK, 1, cv2.LINE_AA)
+    _write(image, "largest", (28, low + 42))
+    entries = {pen.colour: text for _, text, pen in axes}
+    for line, (colour, text) in enumerate(entries.items()):
+        _write(image, text, (12, low + 72 + 18 * line), colour)
+    return image
+
+
+def _mark(image: Image, camera: _Camera, point: Floats) -> None:
+    """A ring around a point, which may lie behind what is seen."""
+    x, y = np.rint(camera.project(point[None])[0][0]).astype(int).tolist()
+    cv2.circle(image, (x, y), 9, _INK, 1, cv2.LINE_AA)
+
+
+def _draw_frame(image: Image, R: Floats) -> None:
+    """The model frame's axes in the corner."""
+    origin = np.array([38.0, _TILE_PX - 38.0])
+    for axis, name, colour in zip(R.T, "xyz", ((200, 40, 40), (30, 140, 40), (40, 70, 210)), strict=True):
+        tip = origin + 24 * axis[:2]
+        _line(image, origin, tip, _Pen(colour))
+        _write(image, name, tuple(np.rint(origin + 32 * axis[:2] + [-3, 4]).astype(int).tolist()), colour)
+
+
+def _line(image: Image, a: Floats, b: Floats, pen: _Pen) -> None:
+    (ax, ay), (bx, by) = np.rint(16 * np.stack([a, b])).astype(int).tolist()  # OpenCV's fixed point
+    cv2.line(image, (ax, ay), (bx, by), pen.colour, pen.width, cv2.LINE_AA, shift=4)
+
+
+def _write(image: Image, text: str, at: tuple[int, ...], colour: Colour = _INK) -> None:
+    cv2.putText(image, text, (at[0], at[1]), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)

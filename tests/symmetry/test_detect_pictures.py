@@ -1,0 +1,69 @@
+"""Pictures: the part, its axis and its residual are where they belong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from detect_shapes import box, prism
+from numpy.typing import NDArray
+
+from generator.symmetry import SymmetryGroup, SymmetryTable
+from generator.symmetry.detection.detect import measure
+from generator.symmetry.detection.gallery import draw_table
+from generator.symmetry.detection.meshes import Mesh
+from generator.symmetry.detection.pictures import picture
+from generator.symmetry.table import SymmetryEntry
+
+VIEWS_PX, HEAD_PX = 1200, 34
+
+
+def drawn(mesh: Mesh, *groups: SymmetryGroup) -> NDArray[np.uint8]:
+    findings = [measure(mesh.vertices_mm, mesh.faces, mesh.diameter_mm, group) for group in groups]
+    return picture("object 1", mesh, findings, 0.01 * mesh.diameter_mm)
+
+
+def mesh_of(x: float, y: float, z: float) -> Mesh:
+    part = box(x, y, z)
+    return Mesh(np.asarray(part.vertices), np.asarray(part.faces), float(np.linalg.norm(part.extents)))
+
+
+def saturation(image: NDArray[np.uint8]) -> NDArray[np.int_]:
+    views = image[HEAD_PX:, :VIEWS_PX].astype(int)
+    return views.max(axis=2) - views.min(axis=2)
+
+
+def test_a_perfect_group_is_grey_and_a_wrong_one_is_coloured() -> None:
+    image = drawn(mesh_of(30, 50, 80), SymmetryGroup.trivial(), SymmetryGroup.from_name("D4"))
+    right, wrong = np.split(image, 2)
+    part = (right[HEAD_PX:, :VIEWS_PX] != 255).any(axis=2)
+    assert 0.2 < part.mean() < 0.6
+    assert (saturation(right)[part] > 60).mean() < 0.02  # only the little model frame has colours
+    assert (saturation(wrong)[part] > 60).mean() > 0.2
+
+
+def test_the_axis_goes_through_the_fixed_point() -> None:
+    """Seen from x = 1, y = -1.4, z = 0.8 the axis z is upright, and moves right with a fixed point further to x."""
+    columns = []
+    for x in (0.0, 12.0):
+        left = drawn(mesh_of(30, 50, 80), SymmetryGroup.from_name("C2", offset_mm=(x, 0, 0)))[HEAD_PX:, :400]
+        red = (left == (210, 20, 20)).all(axis=2)
+        assert red.any(axis=1).mean() > 0.3
+        spread = np.flatnonzero(red.any(axis=0))
+        assert np.ptp(spread) <= 10  # perspective tilts it a little
+        columns.append(float(spread.mean()))
+    assert columns[0] == pytest.approx(200, abs=2)
+    assert columns[1] > 225
+
+
+def test_tables_are_drawn_for_the_meshes_that_are_there(tmp_path: Path) -> None:
+    prism(6).export(tmp_path / "obj_000002.ply")
+    table = SymmetryTable({k: SymmetryEntry(SymmetryGroup.from_name("D6")) for k in (2, 9)})
+    draw_table(table, tmp_path, tmp_path / "pictures", workers=1)
+    (path,) = (tmp_path / "pictures").iterdir()
+    assert path.name == "obj_000002.png"
+    assert cv2.imread(str(path)).shape == (434, 1320, 3)
+    with pytest.raises(ValueError, match="holds none of the table's objects, 9"):
+        draw_table(SymmetryTable({9: table.entries[9]}), tmp_path, tmp_path / "pictures")
