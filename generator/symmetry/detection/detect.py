@@ -134,6 +134,9 @@ class _Detector:
 
     def _promising(self) -> list[tuple[SymmetryGroup, float]]:
         """Refined groups, larger ones first, and a first glance at their residuals in mm."""
+        sphere = self._refined(SymmetryGroup("SO(3)", offset_mm=tuple(self._surface.centroid)))
+        if sphere[1] < _SURELY * self._tolerance:  # there is nothing larger
+            return [sphere]
         search = CandidateSearch(self._surface, self._meter.diameter_mm, self._tolerance, self._meter.dense)
         candidates = search.candidates()
         likely = [c for c in candidates if c.is_likely]
