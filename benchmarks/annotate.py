@@ -24,6 +24,7 @@ from scenes.spec import Intrinsics, View
 
 ROOT = Path(__file__).resolve().parents[1]
 CAMERA = Intrinsics(width=720, height=540, fx=1075.65091572, fy=1073.90347929, cx=360.0, cy=270.0)
+HALF_TABLE_MM = 3000.0
 N_OBJECTS, N_SCENES, N_ROUNDS = 10, 20, 8
 CASES: dict[str, dict[str, bool | float]] = {
     "depth, ids, masks and boxes": {},
@@ -76,7 +77,7 @@ def _random_scene(rng: np.random.Generator, obj_ids: list[int]) -> Scene:
         position_mm = rng.uniform([-120, -120, 20], [120, 120, 60])
         R_m2w = Rotation.random(random_state=rng).as_matrix()
         instances.append(PosedModel(int(obj_id), R_w2c @ R_m2w, R_w2c @ position_mm + t_w2c))
-    return Plane(R_w2c, t_w2c), instances
+    return Plane(R_w2c, t_w2c, HALF_TABLE_MM), instances
 
 
 def _time(caster: RayCaster, scene: Scene, options: Mapping[str, bool | float]) -> float:

@@ -20,6 +20,9 @@ from generator.surface import MISS, NEAR_CLIP_MM, PosedSurface, Rays, Surface, p
 from generator.visibility import Window, canvas_window, image_window, measure_instance, visible_within
 from scenes.spec import Intrinsics
 
+_SURELY_MM = 1e-6
+"""More than rounding can move a point on the table."""
+
 
 @dataclass(frozen=True, eq=False)
 class Plane:
@@ -43,14 +46,26 @@ class Plane:
 
     def depth_mm(self, rays: Rays) -> NDArray[np.float64]:
         """(h, w) z where each ray meets the table, inf where it does not."""
-        normal = self.normal
+        up = self.R_w2c[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            z = (normal @ self.t_w2c) / (rays.x * normal[0] + (rays.y * normal[1] + normal[2])[:, None])
-        met = np.isfinite(z) & (z >= NEAR_CLIP_MM)
+            z: NDArray[np.float64] = (up @ self.t_w2c) / _along(up, rays.x, rays.y)
+            # What a window shows of the plane is convex, and so is the table: with the corners all of it is there.
+            ends = [0, -1]
+            if z.size and self._is_met(rays.x[ends], rays.y[ends], z[np.ix_(ends, ends)], _SURELY_MM).all():
+                return z
+            return np.where(self._is_met(rays.x, rays.y, z), z, np.inf)
+
+    def _is_met(
+        self, x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64], margin_mm: float = 0.0
+    ) -> NDArray[np.bool_]:
+        """Whether points of the plane, on the rays (x, y, 1) of a grid, are in front of the camera and on the table."""
+        met: NDArray[np.bool_] = np.isfinite(z) & (z >= NEAR_CLIP_MM + margin_mm)
         if self.half_size_mm is not None:
-            points = rays.in_model_frame(self.R_w2c)[met, :2] * z[met, None] - (self.t_w2c @ self.R_w2c)[:2]
-            met[met] = np.abs(points).max(axis=1) <= self.half_size_mm
-        return np.where(met, z, np.inf)
+            origin = self.t_w2c @ self.R_w2c
+            for axis in (0, 1):
+                distance = np.abs(_along(self.R_w2c[:, axis], x, y) * z - origin[axis])
+                met &= distance <= self.half_size_mm - margin_mm
+        return met
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,3 +236,9 @@ class _NearestSurface:
     def _seen(self, number: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows and columns, in the body's own window inside the image, where it is the nearest."""
         return pixels_where(self.owner[self._hits[number].rays.window.slices_in(self._image)] == number)
+
+
+def _along(axis: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(h, w) component of the rays (x, y, 1) of a grid along an axis of the camera frame."""
+    component: NDArray[np.float64] = x * axis[0] + (y * axis[1] + axis[2])[:, None]
+    return component

@@ -192,6 +192,26 @@ def test_plane_is_exact() -> None:
     assert square_table.normals is not None and not square_table.normals[~on_table].any()
 
 
+@given(
+    turn=st.tuples(*[st.floats(-180, 180)] * 3),
+    t=st.tuples(st.floats(-300, 300), st.floats(-300, 300), st.floats(-100, 900)),
+    half_size_mm=st.floats(20, 4000),
+)
+def test_a_square_table_is_cut_out_of_the_plane(
+    turn: tuple[float, ...], t: tuple[float, ...], half_size_mm: float
+) -> None:
+    """Seen from anywhere: the points of the unbounded plane that are on the square, and no others."""
+    R = Rotation.from_euler("zyx", turn, degrees=True).as_matrix()
+    rays = Rays.through(CAMERA, image_window(CAMERA))
+    plane = Plane(R, np.array(t)).depth_mm(rays)
+    table = Plane(R, np.array(t), half_size_mm).depth_mm(rays)
+    met = np.isfinite(plane)
+    reach = np.abs((pixel_rays()[met] * plane[met, None] - t) @ R)[:, :2].max(axis=1)
+    assert np.array_equal(table[met][reach < half_size_mm - 1e-3], plane[met][reach < half_size_mm - 1e-3])
+    assert np.isinf(table[met][reach > half_size_mm + 1e-3]).all()
+    assert np.isinf(table[~met]).all()
+
+
 def test_plane_seen_from_below_faces_the_camera() -> None:
     R = np.diag([1.0, -1.0, -1.0])
     above = annotate(plane=Plane(R, np.array([0, 0, 500.0])), normals=True).normals

@@ -9,11 +9,12 @@ import numpy as np
 
 from generator.formats.bop import Entry
 from generator.formats.images import max_depth_mm
+from generator.raycast import Plane
 from generator.review.validate.geometry import Array
 from generator.review.validate.regions import Mask, Region
 from generator.review.validate.report import Finding
 from generator.review.validate.source import Source
-from generator.surface import NEAR_CLIP_MM, Rays, pixels_where
+from generator.surface import Rays, pixels_where
 from generator.visibility import image_window
 
 _SLACK_MM = 0.01
@@ -88,34 +89,7 @@ def stored_depth(depth_mm: Array, scale: float) -> Array:
 
 
 def _table_depth_mm(source: Source, camera_entry: Entry) -> Array:
-    """(H, W) z where the pixels' rays meet the table, the plane z = 0 of the world; inf where they do not."""
+    """(H, W) z where the pixels' rays meet the table, inf where they do not."""
     R, t = np.array(camera_entry["cam_R_w2c"]).reshape(3, 3), np.array(camera_entry["cam_t_w2c"], dtype=np.float64)
-    half_size_mm = 500 * source.recipe.table.size_m
-    rays = Rays.through(source.recipe.intrinsics, image_window(source.recipe.intrinsics))
-    z = _plane_depth_mm(rays, R, t)
-    corners = Rays(rays.window, rays.x[[0, -1]], rays.y[[0, -1]])
-    # What the image shows of the plane is convex: with its corners all of it is on the table.
-    if not _on_table(corners, z[:: len(z) - 1, :: len(z[0]) - 1], R, t, half_size_mm).all():
-        z[~_on_table(rays, z, R, t, half_size_mm)] = np.inf
-    return z
-
-
-def _plane_depth_mm(rays: Rays, R_w2c: Array, t_w2c: Array) -> Array:
-    with np.errstate(divide="ignore"):
-        z: Array = (R_w2c[:, 2] @ t_w2c) / _along(rays, R_w2c[:, 2])
-    return z
-
-
-def _on_table(rays: Rays, z: Array, R_w2c: Array, t_w2c: Array, half_size_mm: float) -> Mask:
-    """Where points of the plane are in front of the camera and on the table."""
-    on_table: Mask = (z >= NEAR_CLIP_MM) & np.isfinite(z)
-    with np.errstate(invalid="ignore"):
-        for axis in (R_w2c[:, 0], R_w2c[:, 1]):
-            on_table &= np.abs(z * _along(rays, axis) - axis @ t_w2c) <= half_size_mm
-    return on_table
-
-
-def _along(rays: Rays, axis: Array) -> Array:
-    """(H, W) component of the rays along an axis of the world, which is given in the camera frame."""
-    component: Array = rays.x * axis[0] + (rays.y * axis[1] + axis[2])[:, None]
-    return component
+    camera = source.recipe.intrinsics
+    return Plane(R, t, 500 * source.recipe.table.size_m).depth_mm(Rays.through(camera, image_window(camera)))
