@@ -37,7 +37,7 @@ class InstanceAnnotation:
         mask: (H, W) bool, the whole silhouette inside the image, occluded or not (amodal).
         mask_visib: (H, W) bool, its visible part.
         px_count_all: pixels of the whole silhouette, also those up to one image size outside the border.
-        px_count_valid: pixels of ``mask`` where the image has depth.
+        px_count_valid: pixels of ``mask`` where the image has depth; see ``ImageAnnotation.where_valid``.
         px_count_visib: pixels of ``mask_visib``.
         visib_fract: px_count_visib / px_count_all, 0 where nothing is seen.
         bbox_obj: [x, y, w, h] of the whole silhouette with w = xmax - xmin; may leave the image.
@@ -72,6 +72,18 @@ class ImageAnnotation:
     instances: tuple[InstanceAnnotation, ...]
     normals: NDArray[np.float32] | None = None
     object_coordinates_mm: NDArray[np.float32] | None = None
+
+    def where_valid(self, has_depth: NDArray[np.bool_]) -> ImageAnnotation:
+        """The same image with ``px_count_valid`` counted where a depth image holds a depth; without that, where any is.
+
+        Args:
+            has_depth: (H, W), as ``generator.formats.images.has_depth`` gives it.
+        """
+        instances = tuple(
+            replace(instance, px_count_valid=int(np.count_nonzero(instance.mask & has_depth)))
+            for instance in self.instances
+        )
+        return replace(self, instances=instances)
 
     def restricted(self, numbers: Sequence[int]) -> ImageAnnotation:
         """The same image with only these instances, renumbered in the given order.

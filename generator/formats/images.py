@@ -76,8 +76,12 @@ def encode_depth(depth_mm: NDArray[np.float64], depth_scale: float) -> bytes:
     if not (np.isfinite(depth_mm).all() and (depth_mm >= 0).all()):
         bad = depth_mm[~(np.isfinite(depth_mm) & (depth_mm >= 0))][0]
         raise ValueError(f"depth {bad} mm cannot be stored; depths are finite and >= 0, with 0 for none")
-    units = np.rint(depth_mm / depth_scale)
-    return _encode(".png", np.where(units <= _UINT16_MAX, units, 0).astype(np.uint16), _DEFLATE)
+    return _encode(".png", _depth_units(depth_mm, depth_scale), _DEFLATE)
+
+
+def has_depth(depth_mm: NDArray[np.float64], depth_scale: float) -> NDArray[np.bool_]:
+    """(H, W) where a depth image of these depths holds any: what is too far, or rounds to 0, it does not hold."""
+    return _depth_units(depth_mm, depth_scale) > 0
 
 
 def encode_mask(mask: NDArray[np.bool_]) -> bytes:
@@ -156,6 +160,11 @@ def decode_object_coordinates(
     """(H, W, 3) model coordinates in millimetres and (H, W) where there are any; errors as in ``decode_rgb``."""
     values, present = _decode_signed(data, name)
     return values * COORDINATE_SCALE_MM, present
+
+
+def _depth_units(depth_mm: NDArray[np.float64], depth_scale: float) -> NDArray[np.uint16]:
+    units = np.rint(depth_mm / depth_scale)
+    return np.where(units <= _UINT16_MAX, units, 0).astype(np.uint16)
 
 
 def _encode_signed(values: NDArray[np.floating[Any]], present: NDArray[np.bool_]) -> bytes:

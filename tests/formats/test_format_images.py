@@ -63,6 +63,14 @@ def test_depth_beyond_the_range_is_no_depth() -> None:
     assert images.decode_depth(images.encode_depth(depth, 0.1), 0.1).tolist() == [[limit, limit, 0, 0]]
 
 
+@given(seeds, st.sampled_from([0.001, 0.1, 100.0]))
+def test_what_a_depth_image_holds_is_known_before(seed: int, scale: float) -> None:
+    """Depths that round to 0, depths beyond the range, and those on either side of both limits."""
+    depth = np.exp(np.random.default_rng(seed).uniform(-8, 16, (9, 11)))
+    depth[0, :4] = np.array([0.5, 0.5001, 65535.49, 65535.51]) * scale
+    assert np.array_equal(images.has_depth(depth, scale), images.decode_depth(images.encode_depth(depth, scale), 1) > 0)
+
+
 @pytest.mark.parametrize("bad", [-1.0, np.nan, np.inf])
 def test_impossible_depth_is_refused(bad: float) -> None:
     with pytest.raises(ValueError, match=f"depth {bad} mm cannot be stored"):

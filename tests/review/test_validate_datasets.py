@@ -27,6 +27,7 @@ MAKES = {
     "jpeg": ("encoding.rgb_format=jpg",),
     "visible within a tolerance": ("labels.visibility_delta_mm=5", EVERYTHING),
     "a small table, fine depth": ("table.size_m=0.5", "encoding.depth_scale=0.01"),
+    "much beyond the depth's range": ("encoding.depth_scale=0.0065",),
     "a low camera": ("camera.elevation_deg=[3, 8]",),
     "other labels": ("labels.scheme=atlas",),
 }

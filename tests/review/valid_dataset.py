@@ -19,6 +19,7 @@ from generator.annotation import ImageAnnotation, PosedModel
 from generator.config import Recipe, load_recipe
 from generator.dataset import Dataset, FinishedImage
 from generator.formats import bop
+from generator.formats.images import has_depth
 from generator.models import ObjectModel, load_models
 from generator.plan import ImagePlan, by_drop
 from generator.raycast import Occluder, Plane, RayCaster
@@ -170,6 +171,8 @@ class _Maker:
         seen = self._caster.annotate(camera, plane, list(models.values()), balls, delta, *extra)
         shown = [n for n, instance in zip(models, seen.instances, strict=True) if instance.mask.any()]
         seen = self._caster.annotate(camera, plane, [models[n] for n in shown], balls, delta, *extra)
+        if "depth" in outputs:
+            seen = seen.where_valid(has_depth(seen.depth_mm, recipe.encoding.depth_scale))
         rng = np.random.default_rng([plan.number, 1])
         rgb = rng.integers(0, 256, (camera.height, camera.width, 3), dtype=np.uint8)
         return FinishedImage(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from generator.annotation import ImageAnnotation, InstanceAnnotation, PosedModel
 from generator.dataset import MODELS_FOLDER
-from generator.formats.images import decode_depth, decode_mask
+from generator.formats.images import decode_depth, decode_mask, has_depth
 from generator.models import ObjectModel, load_models
 from generator.raycast import Occluder, Plane, RayCaster
 from generator.review.validate.depth import stored_depth
@@ -122,7 +122,10 @@ def _cast(source: Source, labels: SceneLabels, im_id: int, caster: RayCaster) ->
     ]
     table = Plane(R_w2c, t_w2c, 500 * source.recipe.table.size_m)
     delta = source.recipe.labels.visibility_delta_mm
-    return caster.annotate(source.recipe.intrinsics, table, posed, unlabelled, delta)
+    cast = caster.annotate(source.recipe.intrinsics, table, posed, unlabelled, delta)
+    if not source.has("depth"):
+        return cast
+    return cast.where_valid(has_depth(cast.depth_mm, source.recipe.encoding.depth_scale))
 
 
 def _compare(source: Source, labels: SceneLabels, im_id: int, expected: ImageAnnotation) -> Iterator[Finding]:

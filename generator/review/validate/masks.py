@@ -92,8 +92,9 @@ def check_info(
 
 def _contradictions(info: Entry) -> Iterator[str]:
     visible, valid, whole = (info[f"px_count_{name}"] for name in ("visib", "valid", "all"))
-    if not visible <= valid <= whole:
-        yield f"px_count_visib {visible} <= px_count_valid {valid} <= px_count_all {whole} does not hold"
+    for name, count in (("visib", visible), ("valid", valid)):
+        if count > whole:
+            yield f"px_count_{name} {count} is more than px_count_all {whole}"
     fraction = visible / whole if whole else 0.0
     if abs(info["visib_fract"] - fraction) > _SAME_FRACTION:
         yield f"visib_fract is {info['visib_fract']}; {visible} of {whole} pixels are {fraction}"
