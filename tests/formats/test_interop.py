@@ -67,11 +67,11 @@ def test_torchvision_loads_the_coco_file(dataset: Path, coco_file: Path) -> None
     loaded = torchvision.datasets.CocoDetection(str(coco_file.parent), str(coco_file))
     assert len(loaded) == 6
     instances = 0
-    for number, (picture, annotations) in zip(loaded.ids, loaded, strict=True):
+    for number, (picture, listed) in zip(loaded.ids, loaded, strict=True):
         image = loaded.coco.imgs[number]
         scene = ScenePaths.of(dataset, image["scene_id"])
         assert np.array_equal(np.asarray(picture), decode_rgb(scene.rgb(image["im_id"]).read_bytes()))
-        for annotation in annotations:
+        for annotation in listed:
             mask = decode_mask(scene.mask_visib(image["im_id"], annotation["gt_id"]).read_bytes())
             assert np.array_equal(loaded.coco.annToMask(annotation), mask)
             instances += 1
@@ -83,10 +83,10 @@ def test_torchvision_makes_targets_of_the_coco_file(coco_file: Path) -> None:
     torchvision = _torchvision()
     plain = torchvision.datasets.CocoDetection(str(coco_file.parent), str(coco_file))
     wrapped = torchvision.datasets.wrap_dataset_for_transforms_v2(plain, target_keys=["boxes", "masks", "labels"])
-    for (_, target), (_, annotations) in zip(wrapped, plain, strict=True):
-        assert target["labels"].tolist() == [annotation["category_id"] for annotation in annotations]
-        assert target["masks"].sum(dim=(1, 2)).tolist() == [annotation["area"] for annotation in annotations]
-        x, y, w, h = np.transpose([annotation["bbox"] for annotation in annotations])
+    for (_, target), (_, listed) in zip(wrapped, plain, strict=True):
+        assert target["labels"].tolist() == [annotation["category_id"] for annotation in listed]
+        assert target["masks"].sum(dim=(1, 2)).tolist() == [annotation["area"] for annotation in listed]
+        x, y, w, h = np.transpose([annotation["bbox"] for annotation in listed])
         assert np.array_equal(target["boxes"].numpy(), np.transpose([x, y, x + w, y + h]))
 
 
