@@ -73,7 +73,7 @@ def adopt(
             file that is to be written exists and is somebody else's.
     """
     scenes = _scenes(root)
-    models = models or _models_folder(root)
+    models = models or models_folder(root)
     models_info = read_models_info(models)
     try:
         declared = SymmetryTable.from_models_info(models_info)
@@ -92,6 +92,18 @@ def adopt(
     return Adoption(models, table, splits, len(scenes), images, instances, written)
 
 
+def models_folder(root: Path) -> Path:
+    """The folder with the models_info.json of a BOP dataset.
+
+    Raises:
+        ValueError: there is none in any of the places where BOP has it.
+    """
+    for name in _MODELS_FOLDERS:
+        if (root / name / INFO_FILE).exists():
+            return root / name
+    raise ValueError(f"{root}: holds no {INFO_FILE} in {', '.join(_MODELS_FOLDERS)}; name the models folder")
+
+
 def _scenes(root: Path) -> list[ScenePaths]:
     if not root.is_dir():
         raise ValueError(f"{root}: no such folder; give that of a BOP dataset")
@@ -103,13 +115,6 @@ def _scenes(root: Path) -> list[ScenePaths]:
             f"{root}: holds no ground truth of a BOP dataset, such as test_primesense/000001/scene_gt.json"
         )
     return scenes
-
-
-def _models_folder(root: Path) -> Path:
-    for name in _MODELS_FOLDERS:
-        if (root / name / INFO_FILE).exists():
-            return root / name
-    raise ValueError(f"{root}: holds no {INFO_FILE} in {', '.join(_MODELS_FOLDERS)}; name the models folder")
 
 
 def _refuse_foreign(root: Path, scenes: list[ScenePaths]) -> None:

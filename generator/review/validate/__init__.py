@@ -4,7 +4,7 @@
 what was expected; nothing is changed. How the check is split: ``source`` (dataset.json, models, symmetries), ``scene``
 (one folder, on a worker), and in it ``labels`` and ``files`` (structure), ``poses``, ``canonical``, ``coco``, and per
 image ``pictures``, ``masks``, ``depth`` and ``surfaces``; ``deep`` casts rays; ``webdataset`` and ``coco_export``
-compare exports.
+compare exports. ``adopted`` does what it can with a dataset that others made and ``adopt`` labelled.
 """
 
 from generator.review.validate.report import KINDS, Finding, Report

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -14,7 +16,6 @@ from generator.review.validate.geometry import Array
 from generator.review.validate.labels import SceneLabels
 from generator.review.validate.poses import Place
 from generator.review.validate.report import Finding
-from generator.review.validate.source import Source
 from generator.symmetry import SymmetryTable
 
 _FIELDS = {
@@ -43,17 +44,26 @@ class Labelling:
     stale: tuple[int, ...] = ()
 
 
-def check_canonical(source: Source, labels: SceneLabels, sound: set[Place]) -> Labelling:
-    """Recompute every label of a sound pose."""
+def check_canonical(
+    symmetries: Path | None, infos: Mapping[int, Entry], labels: SceneLabels, sound: set[Place]
+) -> Labelling:
+    """Recompute every label of a sound pose.
+
+    Args:
+        symmetries: the table; None if there is none that can be used.
+        infos: models_info.json by object id.
+        labels: of a scene folder.
+        sound: the poses that are poses.
+    """
     places = [
         (im_id, gt_id)
         for im_id, gt in labels.gt.items()
         for gt_id in range(len(gt))
         if (im_id, gt_id) in sound and im_id in labels.camera and len(labels.canonical.get(im_id, ())) == len(gt)
     ]
-    if not places or not source.labelled:
+    if not places or symmetries is None:
         return Labelling()
-    expected = _recomputed(source, labels, places)
+    expected = _recomputed(SymmetryTable.read(symmetries), infos, labels, places)
     stored = [labels.canonical[im_id][gt_id] for im_id, gt_id in places]
     differs = ~_agree(_rows(stored), _rows(expected))
     path = labels.paths.scene_gt_canonical
@@ -66,12 +76,13 @@ def check_canonical(source: Source, labels: SceneLabels, sound: set[Place]) -> L
     return Labelling(findings, tuple(sorted(stale)))
 
 
-def _recomputed(source: Source, labels: SceneLabels, places: list[Place]) -> list[Entry]:
-    table = SymmetryTable.read(source.root / SYMMETRIES_FILE)
+def _recomputed(
+    table: SymmetryTable, infos: Mapping[int, Entry], labels: SceneLabels, places: list[Place]
+) -> list[Entry]:
     gt: dict[int, list[Entry]] = {}
     for im_id, gt_id in places:
         gt.setdefault(im_id, []).append(labels.gt[im_id][gt_id])
-    labelled = label_scene(gt, labels.camera, table, source.infos)
+    labelled = label_scene(gt, labels.camera, table, infos)
     return [entry for im_id in gt for entry in labelled[im_id]]
 
 

@@ -66,7 +66,7 @@ def check_deep(task: DeepTask) -> DeepResult:
     caster = RayCaster(meshes)
     for scene_id, im_ids in task.images.items():
         labels = SceneLabels.read(task.source.scene(scene_id))
-        sound, _ = check_poses(task.source, labels)
+        sound, _ = check_poses(task.source.infos, labels)
         for im_id in im_ids:
             unsound = im_id not in labels.image_ids or any(
                 (im_id, gt_id) not in sound for gt_id in range(len(labels.gt[im_id]))

@@ -41,7 +41,7 @@ def check_files(source: Source, labels: SceneLabels) -> Iterator[Finding]:
         for name in sorted(expected.keys() - found):
             yield Finding("missing", folder / name, "not there", *expected[name])
         for name in sorted(found - expected.keys()):
-            place = _place(name)
+            place = place_of(name)
             if place[0] is None or place[0] not in malformed:
                 yield Finding("stray", folder / name, "belongs to no instance in scene_gt.json", *place)
 
@@ -70,7 +70,7 @@ def _expected(source: Source, labels: SceneLabels) -> dict[Path, dict[str, Place
     return folders
 
 
-def _place(name: str) -> Place:
+def place_of(name: str) -> Place:
     """Image and instance that a file name speaks of."""
     matched = _IDS.fullmatch(name)
     if matched is None:

@@ -54,7 +54,8 @@ class ImageCheck:
             yield from check_exr(paths.exr(im_id), im_id, self.shape)
         depth_mm = self._read_depth(pictures)
         files = self._read_masks(pictures)
-        yield from masks.check_masks(source, paths, im_id, files)
+        exact = source.recipe.labels.visibility_delta_mm == 0
+        yield from masks.check_masks(paths, im_id, files, self.shape, exact)
         yield from self._check_instances(files, depth_mm)
         visible = self._visible(files)
         if depth_mm is not None:
@@ -83,7 +84,9 @@ class ImageCheck:
         entries = zip(labels.gt[im_id], labels.gt_info[im_id], files, strict=True)
         for gt_id, (pose, info, masks_) in enumerate(entries):
             if (im_id, gt_id) in self.sound:
-                yield from masks.check_info(source, labels.paths, im_id, gt_id, pose, info, masks_, depth_mm)
+                limits = masks.silhouette_of(source, pose)
+                camera = source.recipe.intrinsics
+                yield from masks.check_info(camera, limits, labels.paths, im_id, gt_id, info, masks_, depth_mm)
             if gt_id in self.annotations:
                 yield from coco.check_annotation(labels, im_id, gt_id, self.annotations[gt_id], masks_, self.shape)
 

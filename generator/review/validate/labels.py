@@ -28,7 +28,7 @@ from generator.review.validate.schemas import (
 _CAMERA = TypeAdapter(CameraEntry)
 _GT = TypeAdapter(list[GtEntry])
 _GT_INFO = TypeAdapter(list[GtInfoEntry])
-_CANONICAL = TypeAdapter(list[CanonicalEntry])
+CANONICAL = TypeAdapter(list[CanonicalEntry])
 _COCO, _COCO_IMAGE, _COCO_ANNOTATION = TypeAdapter(CocoFile), TypeAdapter(CocoImage), TypeAdapter(CocoAnnotation)
 _SPEC = TypeAdapter(RecordedImage)
 
@@ -61,10 +61,10 @@ class SceneLabels:
         findings: list[Finding] = []
         return cls(
             paths,
-            _read_entries(paths.scene_camera, _CAMERA, findings),
-            _read_entries(paths.scene_gt, _GT, findings),
-            _read_entries(paths.scene_gt_info, _GT_INFO, findings),
-            _read_entries(paths.scene_gt_canonical, _CANONICAL, findings),
+            read_entries(paths.scene_camera, _CAMERA, findings),
+            read_entries(paths.scene_gt, _GT, findings),
+            read_entries(paths.scene_gt_info, _GT_INFO, findings),
+            read_entries(paths.scene_gt_canonical, CANONICAL, findings),
             _read_coco(paths.scene_gt_coco, findings),
             _read_spec(paths.scene_spec, findings),
             findings,
@@ -107,10 +107,11 @@ def check_agreement(labels: SceneLabels, plans: Sequence[ImagePlan]) -> Iterator
             yield Finding("ids", path, f"has this image; the recipe asks for {_span(planned)} only", im_id)
     for path, lists in ((paths.scene_gt_info, labels.gt_info), (paths.scene_gt_canonical, labels.canonical)):
         for im_id in sorted(labels.gt.keys() & lists.keys()):
-            yield from _check_lists(path, im_id, labels.gt[im_id], lists[im_id])
+            yield from check_lists(path, im_id, labels.gt[im_id], lists[im_id])
 
 
-def _check_lists(path: Path, im_id: int, gt: list[Entry], others: list[Entry]) -> Iterator[Finding]:
+def check_lists(path: Path, im_id: int, gt: list[Entry], others: list[Entry]) -> Iterator[Finding]:
+    """As many instances of the same objects as in scene_gt.json."""
     if len(gt) != len(others):
         yield Finding("ids", path, f"has {len(others)} instances; scene_gt.json has {len(gt)}", im_id)
         return
@@ -121,7 +122,8 @@ def _check_lists(path: Path, im_id: int, gt: list[Entry], others: list[Entry]) -
             )
 
 
-def _read_entries(path: Path, adapter: TypeAdapter[Any], findings: list[Finding]) -> dict[int, Any]:
+def read_entries(path: Path, adapter: TypeAdapter[Any], findings: list[Finding]) -> dict[int, Any]:
+    """A scene file's entries of the right form, by image id; ``findings`` gets what is wrong with the others."""
     try:
         content = read_scene_json(path)
     except ValueError as error:

@@ -16,6 +16,7 @@ from generator.review.validate.regions import Mask, Region
 from generator.review.validate.report import Finding
 from generator.review.validate.source import Source
 from generator.visibility import NO_BOX, canvas_window, image_window
+from scenes.spec import Intrinsics
 
 _SAME_FRACTION = 1e-9
 
@@ -40,11 +41,11 @@ def read_masks(scene: ScenePaths, im_id: int, n_instances: int, pictures: Pictur
     return masks
 
 
-def check_masks(source: Source, scene: ScenePaths, im_id: int, masks: Sequence[InstanceMasks]) -> Iterator[Finding]:
-    """The visible part is part of the whole, and no pixel shows two instances."""
-    exact = source.recipe.labels.visibility_delta_mm == 0
-    camera = source.recipe.intrinsics
-    owner = np.full((camera.height, camera.width), -1, dtype=np.int16)
+def check_masks(
+    scene: ScenePaths, im_id: int, masks: Sequence[InstanceMasks], shape: tuple[int, int], exact: bool
+) -> Iterator[Finding]:
+    """The visible part is part of the whole, and, if visibility is exact, no pixel shows two instances."""
+    owner = np.full(shape, -1, dtype=np.int16)
     for gt_id, mask in enumerate(masks):
         if mask.visible is None or mask.visible.count == 0:
             continue
@@ -63,11 +64,11 @@ def check_masks(source: Source, scene: ScenePaths, im_id: int, masks: Sequence[I
 
 
 def check_info(
-    source: Source,
+    camera: Intrinsics,
+    limits: Box | None,
     scene: ScenePaths,
     im_id: int,
     gt_id: int,
-    pose: Entry,
     info: Entry,
     masks: InstanceMasks,
     depth: Array | None,
@@ -75,19 +76,27 @@ def check_info(
     """Counts, fraction and boxes of an instance: against each other, the pose and, as bop_toolkit counts, its masks.
 
     Args:
-        source: the dataset.
+        camera: for the size of the image.
+        limits: what the pose allows of the silhouette; None if that is not known.
         scene: the files of the scene folder.
         im_id, gt_id: the image and the instance.
-        pose, info: its entries in scene_gt.json and scene_gt_info.json.
+        info: its entry in scene_gt_info.json.
         masks: its masks, as far as there are any.
         depth: (H, W) millimetres, 0 for none; or None.
     """
-    limits = _limits(source, pose)
-    faults = [*_contradictions(info), *_check_box(source, info, limits), *_recount_visible(info, masks.visible)]
+    faults = [*_contradictions(info), *_check_box(camera, info, limits), *_recount_visible(info, masks.visible)]
     if masks.whole is not None:
-        inside = limits is not None and contains(window_box(image_window(source.recipe.intrinsics)), limits)
+        inside = limits is not None and contains(window_box(image_window(camera)), limits)
         faults += _recount_whole(info, masks.whole, depth, inside)
     yield from (Finding("gt_info", scene.scene_gt_info, fault, im_id, gt_id) for fault in faults)
+
+
+def silhouette_of(source: Source, pose: Entry) -> Box | None:
+    """The pixels that can show an instance at all; None where its model cannot be read or is too near."""
+    if pose["obj_id"] not in source.shapes:
+        return None
+    R = np.array(pose["cam_R_m2c"]).reshape(3, 3)
+    return silhouette_limits(source.recipe.intrinsics, source.shapes[pose["obj_id"]], R, np.array(pose["cam_t_m2c"]))
 
 
 def _contradictions(info: Entry) -> Iterator[str]:
@@ -103,12 +112,12 @@ def _contradictions(info: Entry) -> Iterator[str]:
             yield f"{name} is {info[name]}; it is [-1, -1, -1, -1] where nothing is visible, and only there"
 
 
-def _check_box(source: Source, info: Entry, limits: Box | None) -> Iterator[str]:
+def _check_box(camera: Intrinsics, info: Entry, limits: Box | None) -> Iterator[str]:
     """The whole silhouette is on bop_toolkit's canvas, and where the pose can put it."""
     box = _box(info["bbox_obj"])
     if box == NO_BOX:
         return
-    if not contains(window_box(canvas_window(source.recipe.intrinsics)), box):
+    if not contains(window_box(canvas_window(camera)), box):
         yield f"bbox_obj is {list(box)}, beyond the canvas of three times the image"
     elif limits is not None and not contains(limits, box):
         yield f"bbox_obj is {list(box)}; the pose allows nothing outside {list(limits)}"
@@ -132,13 +141,6 @@ def _recount_whole(info: Entry, whole: Region, depth: Array | None, inside: bool
     box = _box(info["bbox_obj"])
     if box != NO_BOX and (box != whole.box if inside else not contains(box, whole.box)):
         yield f"bbox_obj is {info['bbox_obj']}; mask/ has {list(whole.box)}"
-
-
-def _limits(source: Source, pose: Entry) -> Box | None:
-    if pose["obj_id"] not in source.shapes:
-        return None
-    R = np.array(pose["cam_R_m2c"]).reshape(3, 3)
-    return silhouette_limits(source.recipe.intrinsics, source.shapes[pose["obj_id"]], R, np.array(pose["cam_t_m2c"]))
 
 
 def _box(entry: Sequence[int]) -> Box:

@@ -42,7 +42,7 @@ class Models:
 def read_models(folder: Path, digests: Mapping[int, str]) -> Models:
     """Read and check a models folder; ``digests`` are the SHA-256 of the PLY files the dataset was made of."""
     path = folder / INFO_FILE
-    infos, findings = _read_infos(path)
+    infos, findings = read_infos(path)
     if infos:
         for obj_id in sorted(infos.keys() ^ digests.keys()):
             there = "an entry" if obj_id in infos else "no usable entry"
@@ -61,7 +61,7 @@ def read_models(folder: Path, digests: Mapping[int, str]) -> Models:
     return Models(infos, shapes, tuple(findings))
 
 
-def _read_infos(path: Path) -> tuple[dict[int, Entry], list[Finding]]:
+def read_infos(path: Path) -> tuple[dict[int, Entry], list[Finding]]:
     """The entries of models_info.json that have the right form, and what is wrong with the others."""
     try:
         infos = read_models_info(path.parent)

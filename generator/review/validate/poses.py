@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from generator.formats.bop import camera_matrix
+from generator.formats.bop import Entry, camera_matrix
 from generator.plan import ImagePlan
 from generator.replay import RecordedImage
 from generator.review.validate.geometry import (
@@ -49,8 +49,15 @@ def check_cameras(source: Source, labels: SceneLabels) -> Iterator[Finding]:
             yield Finding("camera", path, f"stands {height:.1f} mm above the table; it must be above", im_id)
 
 
-def check_poses(source: Source, labels: SceneLabels) -> tuple[set[Place], list[Finding]]:
+def check_poses(
+    infos: Mapping[int, Entry], labels: SceneLabels, tolerance: float = ROTATION_TOLERANCE
+) -> tuple[set[Place], list[Finding]]:
     """Rotations are rotations, objects are in front of the camera and known.
+
+    Args:
+        infos: models_info.json by object id.
+        labels: of a scene folder.
+        tolerance: by how much R R^T and det R may be off.
 
     Returns:
         Image and instance of the poses that are sound, and what is wrong with the others.
@@ -62,11 +69,11 @@ def check_poses(source: Source, labels: SceneLabels) -> tuple[set[Place], list[F
     sound: set[Place] = set()
     for place, entry, error in zip(places, entries, rotation_error(R), strict=True):
         faults = []
-        if not error <= ROTATION_TOLERANCE:
-            faults.append(f"cam_R_m2c is no rotation: off by {error:.3g}; 1e-9 is allowed")
+        if not error <= tolerance:
+            faults.append(f"cam_R_m2c is no rotation: off by {error:.3g}; {tolerance:g} is allowed")
         if not entry["cam_t_m2c"][2] > 0:
             faults.append(f"cam_t_m2c has z = {entry['cam_t_m2c'][2]} mm; objects are in front of the camera")
-        if entry["obj_id"] not in source.infos:
+        if entry["obj_id"] not in infos:
             faults.append(f"obj_id {entry['obj_id']} is not in models_info.json")
         findings += [Finding("pose", labels.paths.scene_gt, fault, *place) for fault in faults]
         if not faults:

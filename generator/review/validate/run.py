@@ -15,6 +15,7 @@ from typing import Protocol, TypeVar
 from tqdm import tqdm
 
 from generator.dataset import DATASET_FILE
+from generator.review.validate.adopted import AdoptedTask, check_adopted_scene, is_adopted, left_out, read_adopted
 from generator.review.validate.coco_export import check_coco_export
 from generator.review.validate.deep import DeepTask, check_deep, sample
 from generator.review.validate.report import KINDS, Finding, Report, Tally
@@ -43,10 +44,10 @@ def validate(
     workers: int | None = None,
     deep_images: int = 100,
 ) -> Report:
-    """Check a dataset, and exports made from it.
+    """Check a dataset, and exports made from it; or what can be checked of a dataset that ``adopt`` labelled.
 
     Args:
-        dataset: its folder, as ``generate`` fills it.
+        dataset: its folder, as ``generate`` fills it, or as ``adopt`` leaves it.
         deep: also cast the rays of some images again.
         exports: COCO files and folders of shards that were made from the dataset.
         limit: how many faults of each kind to report in full; all are counted.
@@ -54,10 +55,13 @@ def validate(
         deep_images: how many images to cast again, evenly spread.
 
     Raises:
-        ValueError: there is no dataset, or an export is not there or of no known kind.
+        ValueError: there is no dataset, or an export is not there or of no known kind, or rays or exports of an
+            adopted dataset are to be compared.
     """
     root, exports = dataset.resolve(), tuple(path.resolve() for path in exports)
     _require(root, exports, limit)
+    if is_adopted(root):
+        return _validate_adopted(root, deep, exports, limit, workers)
     header, findings = read_header(root)
     tally = Tally(limit)
     tally.add(findings)
@@ -83,6 +87,22 @@ def validate(
             else:
                 tally.add(check_coco_export(source, export))
     return _report(root, tally, images, instances, compared, exports, tuple(_notes(source, skipped)))
+
+
+def _validate_adopted(root: Path, deep: bool, exports: tuple[Path, ...], limit: int, workers: int | None) -> Report:
+    if deep or exports:
+        what = "--deep" if deep else "--export"
+        raise ValueError(f"{root}: no {DATASET_FILE}; {what} is for datasets that generate made, not for adopted ones")
+    adopted, findings = read_adopted(root, limit)
+    tally = Tally(limit)
+    tally.add(findings)
+    with _workers(workers, len(adopted.scenes)) as run:
+        tasks = [AdoptedTask(adopted, number) for number in range(len(adopted.scenes))]
+        scenes = list(run(check_adopted_scene, tasks, "validating"))
+    for scene in scenes:
+        tally.merge(scene.tally)
+    images, instances = sum(len(s.image_ids) for s in scenes), sum(s.instances for s in scenes)
+    return _report(root, tally, images, instances, notes=tuple(left_out(adopted)))
 
 
 class _Run(Protocol):
@@ -114,8 +134,8 @@ def _require(root: Path, exports: Sequence[Path], limit: int) -> None:
         raise ValueError(f"limit is {limit}; a number of faults >= 0 is needed")
     if not root.is_dir():
         raise ValueError(f"{root}: no such dataset folder")
-    if not (root / DATASET_FILE).exists() and not any(root.glob("*/*/scene_spec.jsonl")):
-        raise ValueError(f"{root}: no {DATASET_FILE}; give a folder that generate filled")
+    if not (root / DATASET_FILE).exists() and not any(root.glob("*/*/scene_spec.jsonl")) and not is_adopted(root):
+        raise ValueError(f"{root}: no {DATASET_FILE}; give a folder that generate filled, or that adopt labelled")
     for path in exports:
         if not path.exists():
             raise ValueError(f"{path}: no such export; give a COCO file or a folder of shards")

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from generator.config import Recipe
 
 _EXACT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+_OPEN = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False, frozen=True)
 
 Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
@@ -52,6 +53,26 @@ class GtInfoEntry(BaseModel):
     px_count_valid: Count
     px_count_visib: Count
     visib_fract: NotNegative
+
+
+class ForeignCameraEntry(BaseModel):
+    """An image in somebody else's scene_camera.json, which may say more, or not where the camera stands."""
+
+    model_config = _OPEN
+    cam_K: Matrix
+    depth_scale: Positive = 1.0
+
+
+class ForeignGtEntry(GtEntry):
+    """An instance in somebody else's scene_gt.json, which may say more."""
+
+    model_config = _OPEN
+
+
+class ForeignGtInfoEntry(GtInfoEntry):
+    """An instance in somebody else's scene_gt_info.json, which may say more."""
+
+    model_config = _OPEN
 
 
 class CanonicalEntry(BaseModel):
@@ -143,7 +164,7 @@ class CameraFile(BaseModel):
 class ModelInfo(BaseModel):
     """An object in models_info.json; its symmetries are read elsewhere."""
 
-    model_config = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False, frozen=True)
+    model_config = _OPEN
     diameter: Positive
     min_x: Number
     min_y: Number

@@ -41,6 +41,11 @@ class Source:
     shapes: Mapping[int, Shape]
     labelled: bool
 
+    @property
+    def symmetries(self) -> Path | None:
+        """The table that labels can be recomputed from, if they can."""
+        return self.root / SYMMETRIES_FILE if self.labelled else None
+
     def scene(self, scene_id: int) -> ScenePaths:
         """The files of a scene folder."""
         return ScenePaths.of(self.root, scene_id, self.recipe.split)
