@@ -14,7 +14,7 @@ from bop_toolkit import NAME, SPLIT_NAME, SPLIT_TYPE, Toolkit
 from numpy.typing import NDArray
 
 from generator.config import load_recipe
-from generator.formats.bop import SPLIT, Entry, ScenePaths, read_scene_json
+from generator.formats.bop import Entry, ScenePaths, read_scene_json
 from generator.formats.files import read_json
 from generator.formats.images import decode_mask
 from generator.formats.webdataset import export_webdataset
