@@ -198,8 +198,14 @@ def uncompressed_rle(mask: NDArray[np.bool_]) -> Entry:
 
     pycocotools writes compressed runs only, which BOP's own readers of mask.json do not all take.
     """
-    pixels = mask.ravel(order="F")
-    edges = np.flatnonzero(np.diff(pixels, prepend=False, append=not pixels[-1]))
+    edges = np.zeros(0, dtype=np.intp)
+    columns = np.flatnonzero(mask.any(axis=0))
+    if columns.size:  # all runs end in these columns, but for the last
+        left, right = int(columns[0]), int(columns[-1]) + 1
+        pixels = np.ascontiguousarray(mask[:, left:right].T).ravel()
+        edges = np.flatnonzero(np.diff(pixels, prepend=False, append=False)) + left * mask.shape[0]
+    if edges.size == 0 or edges[-1] != mask.size:
+        edges = np.append(edges, mask.size)
     return {"counts": np.diff(edges, prepend=0).tolist(), "size": [int(side) for side in mask.shape]}
 
 

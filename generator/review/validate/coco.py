@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from pycocotools import mask as coco_mask
 
-from generator.formats.bop import MIN_VISIB_FRACT, Entry
+from generator.formats.bop import MIN_VISIB_FRACT, Entry, uncompressed_rle
 from generator.review.validate.labels import SceneLabels
 from generator.review.validate.masks import InstanceMasks
 from generator.review.validate.regions import Mask, Region
@@ -96,7 +96,7 @@ def _check_segmentation(
     annotation: Entry, info: Entry, visible: Region | None, shape: tuple[int, int]
 ) -> Iterator[str]:
     rle = annotation["segmentation"]
-    if visible is not None and rle == {"counts": visible.run_lengths(), "size": list(shape)}:
+    if visible is not None and rle == uncompressed_rle(visible.pixels):
         return
     mask = decode(annotation, shape)
     if mask is None:

@@ -48,15 +48,6 @@ class Region:
         """The pixels of the window."""
         return self.pixels[self.crop]
 
-    def run_lengths(self) -> list[int]:
-        """COCO's uncompressed runs, column by column, beginning outside: as ``uncompressed_rle``, on the box alone."""
-        height, size = self.pixels.shape[0], self.pixels.size
-        columns = np.ascontiguousarray(self.pixels[:, self.window.left : self.window.right].T).ravel()
-        changes = np.flatnonzero(np.diff(columns, prepend=False, append=False)) + self.window.left * height
-        edges = changes if changes.size and changes[-1] == size else np.append(changes, size)
-        lengths: list[int] = np.diff(edges, prepend=0).tolist()
-        return lengths
-
 
 def union(regions: Iterable[Region], shape: tuple[int, int]) -> Mask:
     """Pixels of any of the regions."""
