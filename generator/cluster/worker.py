@@ -113,7 +113,7 @@ class Worker:
             sources = _with_photos(supplies, photos)
             if sources is None:
                 return replace(desk, lacks_photos=True)
-            self._studio = Studio(self._place.recipe, sources, self._place.threads, self._log)
+            self._studio = Studio(self._place.recipe, sources, self._place.threads, log=self._log)
         except BlenderError as error:
             raise BlenderError(f"node {desk.node}: {error}") from None
         except ValueError as error:
