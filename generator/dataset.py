@@ -88,12 +88,16 @@ class Dataset:
         """The files of a scene folder."""
         return ScenePaths.of(self.root, scene_id, self.recipe.split)
 
-    def missing(self) -> list[int]:
-        """Numbers of the images that the recipe asks for and that do not exist yet, ascending."""
-        done = {
+    def done(self) -> set[int]:
+        """Numbers of the images that exist."""
+        return {
             image_number(int(path.parent.name), int(path.stem))
             for path in (self.root / RECORDS_FOLDER).glob("*/*.json")
         }
+
+    def missing(self) -> list[int]:
+        """Numbers of the images that the recipe asks for and that do not exist yet, ascending."""
+        done = self.done()
         return [number for number in range(self.recipe.images) if number not in done]
 
     def commit(self, image: FinishedImage) -> None:

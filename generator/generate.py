@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
+import math
+import os
 import sys
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from tqdm import tqdm
 
+from generator import cluster, workers
 from generator.config import Recipe
 from generator.dataset import DATASET_FILE, Dataset
+from generator.device import CPU, Devices
 from generator.formats import bop
 from generator.formats.files import write_json
 from generator.locks import locked
 from generator.plan import Part, by_drop, plan_image
 from generator.replay import read_recipe
+from generator.review.sheet import write_contact_sheet
 from generator.sources import Sources, check_photos, load_sources
 from generator.studio import Studio
-from generator.workers import Job, Outcome, Workplace, run
+from generator.workers import Job, Outcome, Workplace
 from scenes.sampling import sample_scene
 
 FAILURES_FOLDER = ".failures"
+SHEET_FILE = "preview.jpg"
 _DROPS_BETWEEN_ASSEMBLIES = 50
 
 
@@ -47,16 +54,30 @@ class Execution:
     """How the work is done; nothing of it changes what is made.
 
     Attributes:
-        workers: processes that make drops side by side.
+        workers: processes that make drops side by side; None for as many as there are cores, or GPUs.
         threads: of the renderer in each of them; 0 uses every core.
         drop_limit_s: a drop that takes longer is given up.
         part: the share of the drops to make; None for all of them. Other machines may make the others meanwhile.
+        devices: what to render on. The same images come from any CPU; those of a GPU differ by some noise.
+        preview_every: after the first drop, and whenever so many more images are made, the contact sheet is drawn; 0
+            for only in the end.
+        cluster: address of the Ray cluster to make them on ("auto" for the one that runs here); None for processes of
+            this machine.
     """
 
-    workers: int = 1
+    workers: int | None = None
     threads: int = 1
     drop_limit_s: float = 1800.0
     part: Part | None = None
+    devices: Devices = CPU
+    preview_every: int = 0
+    cluster: str | None = None
+
+    @property
+    def processes(self) -> int:
+        """How many workers this machine gets: one per core, or per GPU, if not said."""
+        of_machine = len(os.sched_getaffinity(0)) if self.devices.kind == "cpu" else self.devices.count
+        return self.workers or of_machine
 
 
 def generate(recipe: Recipe, out: Path, execution: Execution) -> Summary:
@@ -76,7 +97,7 @@ def generate(recipe: Recipe, out: Path, execution: Execution) -> Summary:
         check_photos(sources)
     dataset = Dataset.open(out, recipe, sources.models, sources.scenery_digest)
     with locked(out, execution.part):
-        missing = _wanted(dataset, execution.part)
+        missing = wanted(dataset, execution.part)
         failures: list[Outcome] = []
         try:
             if missing:
@@ -85,10 +106,13 @@ def generate(recipe: Recipe, out: Path, execution: Execution) -> Summary:
             dataset.assemble()
             raise
         dataset.finish()
-    return _summarise(dataset, len(missing) - len(_wanted(dataset, execution.part)), failures)
+        summary = _summarise(dataset, len(missing) - len(wanted(dataset, execution.part)), failures)
+        if summary.images:
+            _draw_sheet(dataset)
+    return summary
 
 
-def _wanted(dataset: Dataset, part: Part | None) -> list[int]:
+def wanted(dataset: Dataset, part: Part | None) -> list[int]:
     """Numbers of the images that do not exist yet and are this run's to make."""
     views = dataset.recipe.camera.views_per_drop
     return [number for number in dataset.missing() if part is None or part.takes(plan_image(number, views).drop)]
@@ -130,18 +154,33 @@ def _make(dataset: Dataset, sources: Sources, missing: list[int], execution: Exe
     """Make the missing images; return the drops that failed, in their order."""
     failures: list[Outcome] = []
     jobs = [Job(drop, tuple(images)) for drop, images in by_drop(missing, dataset.recipe.camera.views_per_drop)]
-    place = Workplace(dataset.recipe, dataset.root, execution.threads, execution.drop_limit_s)
     interval = 0.5 if sys.stderr.isatty() else 60.0
+    next_sheet: float = 1 if execution.preview_every else math.inf
     with tqdm(total=len(missing), unit="image", mininterval=interval, maxinterval=interval, smoothing=0.05) as bar:
-        for count, outcome in enumerate(run(jobs, place, min(execution.workers, len(jobs))), start=1):
+        for count, outcome in enumerate(_outcomes(dataset, jobs, execution), start=1):
             bar.update(outcome.made)
             _note_failure(dataset, sources, outcome)
             if outcome.failure:
                 failures.append(outcome)
                 bar.set_postfix(failed=len(failures))
-            if count % _DROPS_BETWEEN_ASSEMBLIES == 0:
+            if count % _DROPS_BETWEEN_ASSEMBLIES == 0 or bar.n >= next_sheet:
                 dataset.assemble()
+            if bar.n >= next_sheet:
+                _draw_sheet(dataset)
+                next_sheet = bar.n + execution.preview_every
     return sorted(failures, key=lambda outcome: outcome.job.drop)
+
+
+def _outcomes(dataset: Dataset, jobs: list[Job], execution: Execution) -> Iterator[Outcome]:
+    place = Workplace(dataset.recipe, dataset.root, execution.threads, execution.drop_limit_s, execution.devices)
+    if execution.cluster is not None:
+        return cluster.run(jobs, place, execution.cluster, execution.workers)
+    return workers.run(jobs, place, min(execution.processes, len(jobs)))
+
+
+def _draw_sheet(dataset: Dataset) -> None:
+    if "rgb" in dataset.recipe.outputs:
+        write_contact_sheet(dataset.root, dataset.root / SHEET_FILE, dataset.recipe.split)
 
 
 def _note_failure(dataset: Dataset, sources: Sources, outcome: Outcome) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import fcntl
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 
 from generator.plan import Part
@@ -48,6 +50,24 @@ def in_turn(root: Path) -> Iterator[None]:
                 return
         except LockedError:  # the one before has taken the file away
             continue
+
+
+def claim(name: str) -> int:
+    """Take the first number, counted from 0, that no other process of this user on this machine has taken.
+
+    It is given back when this process ends, however that comes about.
+    """
+    folder = Path(tempfile.gettempdir()) / f"synthetless-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    for number in count():
+        lock = os.open(folder / f"{name}-{number}.lock", os.O_CREAT | os.O_RDWR, 0o600)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the descriptor is open
+        except OSError:
+            os.close(lock)
+        else:
+            return number
+    raise AssertionError("there are always more numbers")
 
 
 @contextmanager

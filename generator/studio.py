@@ -25,6 +25,7 @@ from generator.models import ObjectModel
 from generator.plan import ImagePlan
 from generator.raycast import Occluder, Plane, RayCaster
 from generator.sources import Sources
+from scenes.blender import CPU, RenderDevice
 from scenes.mesh import Mesh
 from scenes.physics import Collider, NotSettled, PhysicsSettings, collider, settle
 from scenes.render import BuiltScene, Stage
@@ -41,15 +42,27 @@ class DropFailed(Exception):
 
 
 class Studio:
-    """Turns drops into images."""
+    """Turns drops into images.
 
-    def __init__(self, recipe: Recipe, sources: Sources, threads: int = 0, log: Path = Path(os.devnull)) -> None:
+    Attributes:
+        stage: the Blender session.
+    """
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        sources: Sources,
+        threads: int = 0,
+        device: RenderDevice = CPU,
+        log: Path = Path(os.devnull),
+    ) -> None:
         """Load everything that drops share.
 
         Args:
             recipe: what to make.
             sources: from what.
             threads: of the renderer; 0 uses every core.
+            device: what to render on.
             log: file that takes Blender's console output.
         """
         by_role: dict[Role, Mapping[int, ObjectModel]] = {"model": sources.models, "distractor": sources.distractors}
@@ -60,8 +73,15 @@ class Studio:
         self._meshes = {key: Mesh(model.vertices_mm / _MM, model.faces) for key, model in models.items()}
         self._colliders: dict[ModelKey, Collider] = {}
         self._caster = RayCaster({_caster_key(*key): (model.vertices_mm, model.faces) for key, model in models.items()})
-        self._stage = Stage(
-            self._meshes, self._intrinsics, recipe.render, recipe.table.size_m, sources.photos_folder, threads, log
+        self.stage = Stage(
+            self._meshes,
+            self._intrinsics,
+            recipe.render,
+            recipe.table.size_m,
+            sources.photos_folder,
+            threads,
+            device,
+            log,
         )
 
     def make(self, drop: int, plans: Sequence[ImagePlan]) -> Iterator[FinishedImage]:
@@ -76,7 +96,7 @@ class Studio:
             ValueError: an input file became unreadable.
         """
         spec, settled = self.drop(drop)
-        with self._stage.scene(spec, settled) as scene:
+        with self.stage.scene(spec, settled) as scene:
             for plan in plans:
                 yield self._image(plan, scene, settled)
 

@@ -18,10 +18,12 @@ from pebble import ProcessExpired, ProcessPool
 
 from generator.config import Recipe
 from generator.dataset import Dataset, DatasetError
+from generator.device import CPU, Devices
+from generator.locks import claim
 from generator.plan import ImagePlan
 from generator.sources import load_sources
 from generator.studio import DropFailed, Studio
-from scenes.blender import BlenderError
+from scenes.blender import BlenderError, RenderDevice
 
 FAULT_VARIABLE = "SYNTHETLESS_FAULTS"
 """For tests of what survives: "abort:3,hang:5" lets drop 3 kill its worker and drop 5 never end."""
@@ -65,12 +67,14 @@ class Workplace:
         root: the dataset's folder.
         threads: of the renderer, for each worker; 0 uses every core.
         drop_limit_s: a drop that takes longer counts as hung.
+        devices: what to render on; each worker takes one of the GPUs.
     """
 
     recipe: Recipe
     root: Path
     threads: int
     drop_limit_s: float
+    devices: Devices = CPU
 
 
 def run(jobs: Iterable[Job], place: Workplace, workers: int) -> Iterator[Outcome]:
@@ -148,7 +152,15 @@ def _studio(place: Workplace) -> Studio:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's to answer
     logs = place.root / LOGS_FOLDER
     logs.mkdir(exist_ok=True)
-    return Studio(place.recipe, load_sources(place.recipe), place.threads, logs / f"worker-{os.getpid()}.log")
+    log = logs / f"worker-{os.getpid()}.log"
+    return Studio(place.recipe, load_sources(place.recipe), place.threads, take_device(place.devices), log)
+
+
+def take_device(devices: Devices) -> RenderDevice:
+    """The device for this process: the GPUs in turn, so that none waits while another has two workers."""
+    if devices.kind == "cpu":
+        return RenderDevice()
+    return RenderDevice(devices.kind, claim(devices.kind) % devices.count)
 
 
 @lru_cache(maxsize=1)

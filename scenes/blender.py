@@ -6,29 +6,50 @@ import contextlib
 import os
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+KINDS = ("cpu", "optix", "cuda", "hip", "oneapi", "metal")
+"""What Cycles can compute on. Of the GPUs, the faster way to use the same one comes first."""
 
 
 class BlenderError(RuntimeError):
     """Blender cannot be used here; the message says what is missing."""
 
 
-def start(threads: int = 0) -> Any:
-    """Import bpy and empty its start-up scene.
+@dataclass(frozen=True)
+class RenderDevice:
+    """What Cycles computes on: the processor, or one GPU.
+
+    Attributes:
+        kind: one of KINDS.
+        number: which of the GPUs of this kind, counted from 0.
+    """
+
+    kind: str = "cpu"
+    number: int = 0
+
+
+CPU = RenderDevice()
+
+
+def start(threads: int = 0, device: RenderDevice = CPU) -> Any:
+    """Import bpy, empty its start-up scene and choose what Cycles computes on.
 
     Args:
         threads: of the renderer; 0 uses every core.
+        device: what to render on.
 
     Returns:
         The bpy module.
 
     Raises:
-        BlenderError: bpy is not installed, or a shared library that it needs is missing.
+        BlenderError: bpy is not installed, a shared library that it needs is missing, or there is no such device.
     """
     try:
-        with console_to(Path(os.devnull)):  # bpy complains of audio devices that a server does not have
-            import bpy
+        with console_to(Path(os.devnull)), _one_core() if threads == 1 else contextlib.nullcontext():
+            import bpy  # it complains of audio devices that a server does not have
     except ModuleNotFoundError:
         raise BlenderError("Blender is not installed; run: pip install 'synthetless[blender]'") from None
     except ImportError as error:
@@ -38,7 +59,43 @@ def start(threads: int = 0) -> Any:
     render.threads_mode = "FIXED" if threads else "AUTO"
     if threads:
         render.threads = threads
+    if device.kind != "cpu":
+        _compute_on(bpy, device)
     return bpy
+
+
+@contextlib.contextmanager
+def _one_core() -> Iterator[None]:
+    """Let Blender see one core while it counts them.
+
+    ``render.threads`` holds for Cycles' own sampling alone. The denoiser starts a thread for every core of the machine,
+    and with a process per core they wait for each other in busy loops.
+    """
+    if not hasattr(os, "sched_setaffinity"):  # only Linux tells a process its cores
+        yield
+        return
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        yield
+    finally:
+        for thread in Path("/proc/self/task").iterdir():
+            os.sched_setaffinity(int(thread.name), cores)
+
+
+def _compute_on(bpy: Any, device: RenderDevice) -> None:
+    preferences = bpy.context.preferences.addons["cycles"].preferences
+    try:
+        preferences.compute_device_type = device.kind.upper()
+    except TypeError:  # Blender is built without it
+        raise BlenderError(f"this Blender cannot render with {device.kind}; see `synthetless doctor`") from None
+    preferences.refresh_devices()
+    gpus = [item for item in preferences.devices if item.type == device.kind.upper()]
+    if device.number >= len(gpus):
+        raise BlenderError(f"there is no {device.kind} device {device.number} here; see `synthetless doctor`")
+    for item in preferences.devices:
+        item.use = item == gpus[device.number]
+    bpy.context.scene.cycles.device = "GPU"
 
 
 def clear(bpy: Any, keep: set[Any]) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenes import blender, camera, lights, materials
+from scenes.blender import RenderDevice
 from scenes.mesh import Mesh
 from scenes.rotations import matrix
 from scenes.settings import RenderSettings
@@ -36,6 +37,7 @@ class Stage:
         table_size_m: side of the table.
         photos: folder of the photographs, None if only built-in textures are used.
         threads: of the renderer; 0 uses every core.
+        device: what to render on.
         log: file that takes Blender's console output.
     """
 
@@ -45,12 +47,17 @@ class Stage:
     table_size_m: float
     photos: Path | None = None
     threads: int = 0
+    device: RenderDevice = blender.CPU
     log: Path = Path(os.devnull)
     _loaded: dict[tuple[Role, int], Any] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
-        self.bpy = blender.start(self.threads)
-        _configure(self.bpy.context.scene, self.settings)
+        self.bpy = blender.start(self.threads, self.device)
+        self.configure(self.settings)
+
+    def configure(self, settings: RenderSettings) -> None:
+        """Render in this way from now on."""
+        _configure(self.bpy.context.scene, settings)
 
     @contextlib.contextmanager
     def scene(self, spec: SceneSpec, settled: Sequence[Pose]) -> Iterator[BuiltScene]:
@@ -155,7 +162,6 @@ def read_exr(file: Path) -> NDArray[np.float32]:
 def _configure(scene: Any, settings: RenderSettings) -> None:
     scene.render.engine = "CYCLES"
     cycles = scene.cycles
-    cycles.device = "CPU"
     cycles.samples = settings.samples
     cycles.use_adaptive_sampling = False  # gains nothing at these sample counts
     cycles.max_bounces = settings.bounces
@@ -165,8 +171,9 @@ def _configure(scene: Any, settings: RenderSettings) -> None:
     cycles.use_denoising = settings.denoiser != "none"
     cycles.denoiser = "OPENIMAGEDENOISE"
     cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
-    cycles.denoising_quality = "HIGH"
-    cycles.denoising_prefilter = "ACCURATE" if settings.denoiser == "accurate" else "NONE"
+    cycles.denoising_use_gpu = cycles.device == "GPU"
+    cycles.denoising_quality = "BALANCED" if settings.denoiser == "fast" else "HIGH"
+    cycles.denoising_prefilter = "NONE" if settings.denoiser == "fast" else "ACCURATE"
     scene.render.use_persistent_data = False  # it would show the previous scene's texture again
     scene.render.image_settings.file_format = "OPEN_EXR"
     scene.render.image_settings.color_mode = "RGB"

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, model_validator
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 FloatRange = tuple[float, float]
@@ -143,17 +143,37 @@ class TableSettings(Settings):
     """Specular level of the table; 0 renders it purely diffuse, which is faster."""
 
 
+QUALITIES: dict[str, dict[str, Any]] = {
+    "draft": {"samples": 4, "denoiser": "fast"},
+    "standard": {"samples": 12, "denoiser": "accurate"},
+    "reference": {"samples": 256, "denoiser": "accurate"},
+}
+"""What the named qualities stand for; how near each comes to a converged render is in docs/scaling.md."""
+
+
 class RenderSettings(Settings):
     """Cycles."""
 
-    samples: Annotated[int, Bounds(1, 65536, "samples")] = 16
-    """Light paths per pixel."""
-    denoiser: Literal["none", "fast", "accurate"] = "accurate"
-    """Open Image Denoise with albedo and normal guides: none, fast (guides used raw), accurate (guides prefiltered)."""
+    quality: Literal["draft", "standard", "reference"] = "standard"
+    """Sets samples and denoiser: draft to try a recipe out, standard to train with, reference to compare with."""
+    samples: Annotated[int, Bounds(1, 65536, "samples")] = QUALITIES["standard"]["samples"]
+    """Light paths per pixel; if not given, those of the quality."""
+    denoiser: Literal["none", "fast", "accurate"] = QUALITIES["standard"]["denoiser"]
+    """Open Image Denoise: none, fast (small network, raw guides), accurate (large, prefiltered); if not given, the
+    quality's."""
     bounces: Annotated[int, Bounds(0, 128, "bounces")] = 3
     """Reflections of light between surfaces."""
     exposure: Annotated[FloatRange, Bounds(0.01, 0.99)] = (0.15, 0.7)
     """Mean displayed luminance that an image is kept within, as a camera's automatic exposure would."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _follow_quality(cls, given: Any) -> Any:
+        """What is not given follows from the quality; written out, so that a stored recipe keeps its meaning."""
+        if not isinstance(given, dict):
+            return given
+        quality = given.get("quality", "standard")
+        return {**QUALITIES.get(quality, {}), **given} if isinstance(quality, str) else given
 
 
 class SceneSettings(Settings):

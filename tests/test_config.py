@@ -125,3 +125,24 @@ def _leaves(tree: dict[str, object], prefix: str = "") -> list[str]:
     for key, value in tree.items():
         leaves += _leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else [f"{prefix}{key}"]
     return leaves
+
+
+def test_a_quality_sets_what_is_not_given() -> None:
+    draft, standard = load_recipe(None, ["render.quality=draft"]).render, load_recipe(None).render
+    assert draft.samples < standard.samples < load_recipe(None, ["render.quality=reference"]).render.samples
+    assert draft.denoiser == "fast"
+    mixed = load_recipe(None, ["render.quality=draft", "render.samples=77"]).render
+    assert (mixed.samples, mixed.denoiser) == (77, "fast")
+
+
+@pytest.mark.parametrize("quality", ["draft", "standard", "reference"])
+def test_a_stored_recipe_says_what_its_quality_stood_for(quality: str) -> None:
+    stored = dump_recipe(load_recipe(None, [f"render.quality={quality}"]))
+    assert stored["render"]["samples"] > 0
+    assert Recipe.model_validate(stored).render == load_recipe(None, [f"render.quality={quality}"]).render
+
+
+def test_an_unknown_quality_is_told() -> None:
+    for value in ("best", "[draft]", "3"):
+        with pytest.raises(RecipeError, match=r"render\.quality"):
+            load_recipe(None, [f"render.quality={value}"])

@@ -1,0 +1,51 @@
+"""Which device to render on, among those that Cycles sees."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+from generator import machine
+from scenes.blender import KINDS, BlenderError
+
+
+@dataclass(frozen=True)
+class Devices:
+    """What a machine renders on.
+
+    Attributes:
+        kind: cpu, or how its GPUs are used: optix, cuda, hip, oneapi or metal.
+        count: how many GPUs of this kind there are; 1 for the processor.
+    """
+
+    kind: str = "cpu"
+    count: int = 1
+
+
+CPU = Devices()
+
+
+def choose(wanted: str) -> Devices:
+    """Find the devices of a kind; "auto" takes the best that there is.
+
+    Raises:
+        ValueError: this machine has none of them; the message says what it has.
+        BlenderError: Blender cannot tell.
+    """
+    if wanted == "cpu":
+        return CPU
+    answer = machine.ask(machine.probe("devices"))
+    if answer.found is None:
+        raise BlenderError(f"the devices cannot be listed: {answer.problem}; see `synthetless doctor`")
+    return best([device["type"] for device in answer.found["devices"]], wanted)
+
+
+def best(seen: list[str], wanted: str) -> Devices:
+    """Choose among the types of the devices that Cycles sees; errors as in ``choose``."""
+    counts = Counter(kind.lower() for kind in seen)
+    if wanted == "auto":
+        wanted = next((kind for kind in KINDS if kind != "cpu" and counts[kind]), "cpu")
+    if wanted != "cpu" and not counts[wanted]:
+        found = ", ".join(kind for kind in KINDS if counts[kind]) or "none"
+        raise ValueError(f"--device {wanted}: Blender sees no such device here, only {found}; see `synthetless doctor`")
+    return Devices(wanted, counts[wanted] if wanted != "cpu" else 1)
