@@ -5,10 +5,8 @@ Each of these packages is large, so that a test is skipped where its package is 
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,28 +15,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from packages import package_or_skip, torchvision_or_skip
 
 from generator.formats.bop import ScenePaths, read_scene_json
 from generator.formats.coco import export_coco
 from generator.formats.images import decode_depth, decode_mask, decode_rgb
 from generator.formats.webdataset import export_webdataset
-
-
-def _package(name: str, where: str = "extra 'interop' has it") -> Any:
-    return pytest.importorskip(name, reason=f"{name.partition('.')[0]} is not installed; {where}")
-
-
-def _torchvision() -> Any:
-    """torchvision; its data sets alone where its compiled operators do not fit the build of torch (CPU or CUDA)."""
-    torch = _package("torch")
-    try:
-        return _package("torchvision")
-    except RuntimeError:  # "operator torchvision::nms does not exist"
-        for name in [name for name in sys.modules if name.partition(".")[0] == "torchvision"]:
-            del sys.modules[name]
-        for name in ("nms", "qnms"):
-            torch.library.define(f"torchvision::{name}", "(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-        return importlib.import_module("torchvision")
 
 
 def _scene_of(dataset: Path, key: str) -> tuple[ScenePaths, int]:
@@ -63,7 +45,7 @@ def shards(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> list[str]
 
 
 def test_torchvision_loads_the_coco_file(dataset: Path, coco_file: Path) -> None:
-    torchvision = _torchvision()
+    torchvision = torchvision_or_skip()
     loaded = torchvision.datasets.CocoDetection(str(coco_file.parent), str(coco_file))
     assert len(loaded) == 6
     instances = 0
@@ -80,7 +62,7 @@ def test_torchvision_loads_the_coco_file(dataset: Path, coco_file: Path) -> None
 
 def test_torchvision_makes_targets_of_the_coco_file(coco_file: Path) -> None:
     """Its transforms take boxes, masks and categories, the targets of its own detectors."""
-    torchvision = _torchvision()
+    torchvision = torchvision_or_skip()
     plain = torchvision.datasets.CocoDetection(str(coco_file.parent), str(coco_file))
     wrapped = torchvision.datasets.wrap_dataset_for_transforms_v2(plain, target_keys=["boxes", "masks", "labels"])
     for (_, target), (_, listed) in zip(wrapped, plain, strict=True):
@@ -107,7 +89,7 @@ def _as_they_are(batch: list[Any]) -> list[Any]:
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_torch_loads_every_image_once(dataset: Path, shards: list[str], workers: int) -> None:
-    torch, webdataset = _package("torch"), _package("webdataset")
+    torch, webdataset = package_or_skip("torch"), package_or_skip("webdataset")
     samples = webdataset.WebDataset(shards, shardshuffle=False).map(_tensors)
     loader = torch.utils.data.DataLoader(samples, batch_size=2, num_workers=workers, collate_fn=_as_they_are)
     seen: Counter[str] = Counter()
@@ -125,7 +107,7 @@ def test_hugging_face_streams_the_shards(
     dataset: Path, shards: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    datasets = _package("datasets")
+    datasets = package_or_skip("datasets")
     stream = datasets.load_dataset(
         "webdataset", data_files={"train": shards}, split="train", streaming=True, cache_dir=str(tmp_path)
     )
@@ -140,7 +122,7 @@ def test_hugging_face_streams_the_shards(
 def test_fiftyone_imports_the_coco_file(dataset: Path, coco_file: Path) -> None:
     """Its importer alone, which fills its database: the database itself is a server, which is seldom at hand."""
     os.environ.setdefault("FIFTYONE_DO_NOT_TRACK", "true")
-    coco = _package("fiftyone.utils.coco", "pip install fiftyone")
+    coco = package_or_skip("fiftyone.utils.coco", "pip install fiftyone")
     labels = json.loads(coco_file.read_text())
     images = {image["file_name"]: image for image in labels["images"]}
     importer = coco.COCODetectionDatasetImporter(
