@@ -62,9 +62,9 @@ def living_nodes(ray: Any) -> list[Node]:
 
 def needs_of(place: Workplace, nodes: Iterable[Node]) -> dict[str, int]:
     """What a worker takes of a node, as options of a Ray actor: a core for each thread, or a core and a GPU."""
-    device = getattr(place, "device", "cpu")
+    kind = place.devices.kind
     has_gpu = any(node["Resources"].get("GPU", 0) >= 1 for node in nodes)
-    if device == "cpu" or (device == "auto" and not has_gpu):
+    if kind == "cpu" or (kind == "auto" and not has_gpu):
         return {"num_cpus": max(1, place.threads)}
     return {"num_cpus": 1, "num_gpus": 1}
 

@@ -19,6 +19,7 @@ from uuid import uuid4
 from generator.cluster.connection import Node, connected, in_words, living_nodes, needs_of, room_for
 from generator.cluster.worker import Delivery, Desk, Supplies, Worker
 from generator.dataset import Dataset
+from generator.device import CPU
 from generator.formats.files import atomic_write
 from generator.sources import Sources, load_sources
 from generator.workers import FAULT_VARIABLE, LOGS_FOLDER, Job, Outcome, Workplace
@@ -87,17 +88,17 @@ class _Crew:
 
     def __init__(self, ray: Any, place: Workplace, sources: Sources, token: Path, workers: int | None) -> None:
         self._ray = ray
-        self._place = place
         self._sources = sources
         self._dataset = Dataset(place.root, place.recipe)
         self._wanted = workers
         self._nodes, self._looked = living_nodes(ray), time.monotonic()
         self._needs = needs_of(place, self._nodes)
+        self._place = place if "num_gpus" in self._needs else replace(place, devices=CPU)
         if not (workers or room_for(self._needs, self._nodes)):
             raise ValueError(f"no node of the Ray cluster has room for a worker, which needs {in_words(self._needs)}")
         options = {"max_restarts": 0, "max_task_retries": 0, "scheduling_strategy": "SPREAD", **self._needs}
         self._actor = ray.remote(**options)(Worker)
-        self._introduction = (ray.put(place), token, os.environ.get(FAULT_VARIABLE, ""))
+        self._introduction = (ray.put(self._place), token, os.environ.get(FAULT_VARIABLE, ""))
         self._supplies = ray.put(Supplies.of(sources))
         self._photos: Any = None
         self._waiting: deque[Job] = deque()

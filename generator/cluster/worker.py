@@ -14,11 +14,12 @@ from pathlib import Path
 import psutil
 
 from generator.dataset import Dataset, DatasetError, FinishedImage
+from generator.device import Devices, choose
 from generator.formats.files import atomic_write
 from generator.sources import Sources
 from generator.studio import DropFailed, Studio
 from generator.workers import _GROWTH_LIMIT, FAULT_VARIABLE, LOGS_FOLDER, Job, Workplace, _inject_fault
-from scenes.blender import BlenderError
+from scenes.blender import BlenderError, RenderDevice
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ class Worker:
             photos: content of the photographs by name; None as long as no node has been found to lack them.
 
         Raises:
-            ValueError: something else is installed here.
+            ValueError: something else is installed here, or there is no such device.
             BlenderError: Blender cannot be used.
         """
         import ray
@@ -113,7 +114,8 @@ class Worker:
             sources = _with_photos(supplies, photos)
             if sources is None:
                 return replace(desk, lacks_photos=True)
-            self._studio = Studio(self._place.recipe, sources, self._place.threads, log=self._log)
+            device = _device(self._place.devices)
+            self._studio = Studio(self._place.recipe, sources, self._place.threads, device, self._log)
         except BlenderError as error:
             raise BlenderError(f"node {desk.node}: {error}") from None
         except ValueError as error:
@@ -163,6 +165,16 @@ def check_versions(wanted: Mapping[str, str]) -> None:
     for name, here in versions().items():
         if here != wanted[name]:
             raise ValueError(f"has {name} {here}, but {wanted[name]} is needed; install the same on every node")
+
+
+def _device(devices: Devices) -> RenderDevice:
+    """The processor, or the GPU that Ray keeps for this worker, which sees no other."""
+    if devices.kind == "cpu":
+        return RenderDevice()
+    kind = choose(devices.kind).kind
+    if kind == "cpu":
+        raise ValueError("offers a GPU to Ray, but Blender sees none; see `synthetless doctor`")
+    return RenderDevice(kind)
 
 
 def _with_photos(supplies: Supplies, photos: Mapping[str, bytes] | None) -> Sources | None:
