@@ -26,6 +26,8 @@ import pytest
 import trimesh
 import yaml
 
+from docs.figures.tless import overlay
+
 pytest.importorskip("bpy", reason="the documentation's commands need Blender, extra 'blender'")
 pytest.importorskip("matplotlib", reason="the documentation's commands need matplotlib, extra 'preview'")
 
@@ -41,7 +43,7 @@ SMALL_RECIPE: dict[str, Any] = {
 """What the recipes of configs/ are changed to; their other settings stay."""
 
 CHANGED = (
-    (r"--images \d+", "--images 2", "two images show what 30,000 would"),
+    (r"--images \d+(?!.*--dry-run)", "--images 2", "two images show what 30,000 would"),
     (r"symmetries detect T-LESS/models_cad", "symmetries detect {part}", "30 parts take minutes"),
     (r"^make ", "make -o setup ", "the environment is there already"),
     (r"fetch tless --to \S+$", r"\g<0> --from {tless}", "a test has no network"),
@@ -279,6 +281,24 @@ def test_a_page_can_be_followed(
         reader.follow(block)
     if reader.not_possible:
         pytest.skip("all but: " + "; ".join(reader.not_possible))
+
+
+@pytest.mark.blender
+def test_the_script_of_the_readme_s_picture_draws_one(demo: Path) -> None:
+    halves = []
+    for im_id in (0, 1):
+        drawn = overlay(demo, im_id)
+        middle = drawn.shape[1] // 2
+        halves.append((drawn[:, : middle - 4], drawn[:, middle + 4 :]))
+    assert all(left.shape == right.shape and min(left.shape[:2]) > 50 for left, right in halves)
+    assert any((left != right).any() for left, right in halves), "true poses, canonical poses"
+
+
+def test_pictures_are_small_and_shown() -> None:
+    text = "".join(page.read_text(encoding="utf-8") for page in PAGES.values())
+    for picture in (ROOT / "docs" / "images").iterdir():
+        assert picture.stat().st_size < 300_000, picture.name
+        assert f"images/{picture.name})" in text, picture.name
 
 
 @pytest.mark.parametrize("name", PAGES)
