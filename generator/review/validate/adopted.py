@@ -207,7 +207,7 @@ def _check_image(labels: SceneLabels, im_id: int, shape: tuple[int, int]) -> Ite
     infos = labels.gt_info.get(im_id, [])
     if len(infos) == len(files):
         for gt_id, (info, of_instance) in enumerate(zip(infos, files, strict=True)):
-            yield from masks.check_info(camera, None, paths, im_id, gt_id, info, of_instance, depth)
+            yield from masks.check_info(camera, None, paths, im_id, gt_id, info, of_instance, depth, masks.AS_RENDERED)
     yield from pictures.findings
 
 

@@ -18,7 +18,34 @@ from generator.review.validate.source import Source
 from generator.visibility import NO_BOX, canvas_window, image_window
 from scenes.spec import Intrinsics
 
-_SAME_FRACTION = 1e-9
+
+@dataclass(frozen=True)
+class Slack:
+    """By how much counts, fractions and boxes may be off from the masks; by nothing, if ray casting made both.
+
+    Attributes:
+        share, px: a count may be off by this share of it, and so many pixels.
+        box_px: each side of a box.
+        fraction: a visible fraction.
+    """
+
+    share: float = 0.0
+    px: int = 0
+    box_px: int = 0
+    fraction: float = 1e-9
+
+    def allows(self, count: int, expected: int) -> bool:
+        """Whether a count is close enough."""
+        return abs(count - expected) <= self.px + self.share * expected
+
+    def allows_box(self, box: Box, expected: Box) -> bool:
+        """Whether all sides of a box are close enough."""
+        return contains(_grown(expected, self.box_px), box) and contains(_grown(box, self.box_px), expected)
+
+
+EXACT = Slack()
+AS_RENDERED = Slack(share=0.01, px=2, box_px=1, fraction=1e-4)
+"""bop_toolkit renders masks and counts apart, on canvases of two sizes, and they differ in a few pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +99,7 @@ def check_info(
     info: Entry,
     masks: InstanceMasks,
     depth: Array | None,
+    slack: Slack = EXACT,
 ) -> Iterator[Finding]:
     """Counts, fraction and boxes of an instance: against each other, the pose and, as bop_toolkit counts, its masks.
 
@@ -83,11 +111,14 @@ def check_info(
         info: its entry in scene_gt_info.json.
         masks: its masks, as far as there are any.
         depth: (H, W) millimetres, 0 for none; or None.
+        slack: what is allowed.
     """
-    faults = [*_contradictions(info), *_check_box(camera, info, limits), *_recount_visible(info, masks.visible)]
+    faults = [*_contradictions(info, slack), *_check_box(camera, info, limits)]
+    if masks.visible is not None:
+        faults += _recount_visible(info, masks.visible, slack)
     if masks.whole is not None:
         inside = limits is not None and contains(window_box(image_window(camera)), limits)
-        faults += _recount_whole(info, masks.whole, depth, inside)
+        faults += _recount_whole(info, masks.whole, depth, inside, slack)
     yield from (Finding("gt_info", scene.scene_gt_info, fault, im_id, gt_id) for fault in faults)
 
 
@@ -99,13 +130,13 @@ def silhouette_of(source: Source, pose: Entry) -> Box | None:
     return silhouette_limits(source.recipe.intrinsics, source.shapes[pose["obj_id"]], R, np.array(pose["cam_t_m2c"]))
 
 
-def _contradictions(info: Entry) -> Iterator[str]:
+def _contradictions(info: Entry, slack: Slack) -> Iterator[str]:
     visible, valid, whole = (info[f"px_count_{name}"] for name in ("visib", "valid", "all"))
     for name, count in (("visib", visible), ("valid", valid)):
         if count > whole:
             yield f"px_count_{name} {count} is more than px_count_all {whole}"
     fraction = visible / whole if whole else 0.0
-    if abs(info["visib_fract"] - fraction) > _SAME_FRACTION:
+    if abs(info["visib_fract"] - fraction) > slack.fraction:
         yield f"visib_fract is {info['visib_fract']}; {visible} of {whole} pixels are {fraction}"
     for name in ("bbox_obj", "bbox_visib"):
         if (_box(info[name]) == NO_BOX) != (visible == 0):
@@ -123,24 +154,28 @@ def _check_box(camera: Intrinsics, info: Entry, limits: Box | None) -> Iterator[
         yield f"bbox_obj is {list(box)}; the pose allows nothing outside {list(limits)}"
 
 
-def _recount_visible(info: Entry, visible: Region | None) -> Iterator[str]:
-    if visible is not None:
-        if info["px_count_visib"] != visible.count:
-            yield f"px_count_visib is {info['px_count_visib']}; mask_visib/ has {visible.count}"
-        if _box(info["bbox_visib"]) != visible.box:
-            yield f"bbox_visib is {info['bbox_visib']}; mask_visib/ has {list(visible.box)}"
+def _recount_visible(info: Entry, visible: Region, slack: Slack) -> Iterator[str]:
+    if not slack.allows(info["px_count_visib"], visible.count):
+        yield f"px_count_visib is {info['px_count_visib']}; mask_visib/ has {visible.count}"
+    elif visible.count and info["px_count_visib"] and not slack.allows_box(_box(info["bbox_visib"]), visible.box):
+        yield f"bbox_visib is {info['bbox_visib']}; mask_visib/ has {list(visible.box)}"
 
 
-def _recount_whole(info: Entry, whole: Region, depth: Array | None, inside: bool) -> Iterator[str]:
+def _recount_whole(info: Entry, whole: Region, depth: Array | None, inside: bool, slack: Slack) -> Iterator[str]:
     """``inside`` says that the silhouette cannot leave the image, so that the mask has all of it."""
     valid = whole.count if depth is None else int(np.count_nonzero(whole.inside & (depth[whole.crop] > 0)))
-    if info["px_count_valid"] != valid:
+    if not slack.allows(info["px_count_valid"], valid):
         yield f"px_count_valid is {info['px_count_valid']}; mask/ has {valid} where there is depth"
-    if info["px_count_all"] != whole.count if inside else info["px_count_all"] < whole.count:
+    if (inside or info["px_count_all"] < whole.count) and not slack.allows(info["px_count_all"], whole.count):
         yield f"px_count_all is {info['px_count_all']}; mask/ has {whole.count}"
     box = _box(info["bbox_obj"])
-    if box != NO_BOX and (box != whole.box if inside else not contains(box, whole.box)):
+    same = slack.allows_box(box, whole.box) if inside else contains(_grown(box, slack.box_px), whole.box)
+    if box != NO_BOX and whole.count and not same:
         yield f"bbox_obj is {info['bbox_obj']}; mask/ has {list(whole.box)}"
+
+
+def _grown(box: Box, px: int) -> Box:
+    return box[0] - px, box[1] - px, box[2] + 2 * px, box[3] + 2 * px
 
 
 def _box(entry: Sequence[int]) -> Box:
