@@ -1,0 +1,138 @@
+"""Where the time of an image goes: ``python -m benchmarks.throughput [--models DIR] [--textures DIR] [--images 12]``.
+
+One worker with one thread makes images of the T-LESS recipe, 720x540 with 10 objects, and commits them to a temporary
+folder. Stages are wall time, from Python's profiler and from Cycles' own log; the share of the time that is not Cycles'
+sampling and denoising is what this project can answer for. Prints a table, writes benchmarks/results/throughput.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import json
+import pstats
+import re
+import tempfile
+import time
+from pathlib import Path
+
+from generator import device
+from generator.config import Recipe, load_recipe
+from generator.dataset import Dataset
+from generator.plan import plan_image
+from generator.sources import load_sources
+from generator.studio import Studio
+from generator.workers import take_device
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULT = ROOT / "benchmarks" / "results" / "throughput.json"
+
+STAGES = {
+    "sample": [("sampling.py", "sample_scene")],
+    "physics": [("physics.py", "settle"), ("studio.py", "_collider")],
+    "build": [("render.py", "scene")],
+    "annotate": [("raycast.py", "annotate")],
+    "develop": [("develop.py", "exposure_gain"), ("develop.py", "develop")],
+    "encode": [("studio.py", "encode")],
+    "commit": [("dataset.py", "commit")],
+}
+"""Functions whose time, with all that they call, makes up a stage."""
+
+_LINE = re.compile(r"^Fra.*Time:(\d+):(\d+\.\d+) .*(Sample 0/|Finished)", re.MULTILINE)
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--models", default="builtin", help="BOP models folder")
+    parser.add_argument("--textures", default="builtin", help="folder of photographs")
+    parser.add_argument("--images", type=int, default=12)
+    parser.add_argument("--views", type=int, default=4, help="images of one drop")
+    parser.add_argument("--quality", default="standard")
+    parser.add_argument("--device", default="cpu")
+    arguments = parser.parse_args()
+    overrides = [
+        "objects.count=[10, 10]",
+        f"camera.views_per_drop={arguments.views}",
+        f"render.quality={arguments.quality}",
+        f"source.models={json.dumps(arguments.models)}",
+        f"source.textures={json.dumps(arguments.textures)}",
+    ]
+    stages = measure(load_recipe(ROOT / "configs" / "tless_bop.yaml", overrides), arguments.images, arguments.device)
+    total = sum(stages.values()) - stages["start"]
+    for name, seconds in stages.items():
+        share = "" if name == "start" else f"{seconds / total:7.1%}"
+        print(f"{name:10} {seconds / (1 if name == 'start' else arguments.images):8.3f} s {share}")
+    outside = 1 - (stages["sampling"] + stages["denoise"]) / total
+    rate = 3600 * arguments.images / total
+    print(f"outside Cycles' sampling and denoising: {outside:.1%}; {rate:.0f} images an hour and worker")
+    RESULT.parent.mkdir(exist_ok=True)
+    result = {**vars(arguments), "stages_s": stages, "outside_share": outside, "images_per_hour": rate}
+    RESULT.write_text(json.dumps(result, indent=1) + "\n")
+
+
+def measure(recipe: Recipe, images: int, wanted: str) -> dict[str, float]:
+    """Seconds of each stage for all images together; "start" is once."""
+    views = recipe.camera.views_per_drop
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "blender.log"
+        sources = load_sources(recipe)
+        dataset = Dataset.open(Path(folder) / "dataset", recipe, sources.models, sources.scenery_digest)
+        began = time.perf_counter()
+        studio = Studio(recipe, sources, 1, take_device(device.choose(wanted)), log)
+        stages = {"start": time.perf_counter() - began}
+        for drop in range(-(-images // views)):  # colliders are made once for each model, whatever the number of images
+            studio.drop(drop)
+
+        profile = cProfile.Profile()
+        began = time.perf_counter()
+        profile.enable()
+        for number in range(0, images, views):
+            plans = [plan_image(n, views) for n in range(number, min(number + views, images))]
+            for image in studio.make(number // views, plans):
+                dataset.commit(image)
+        profile.disable()
+        total = time.perf_counter() - began
+        sync, cycles = _logged(log)
+        log.unlink()
+        share = _share_of_sampling(studio, log, images, views)
+        stages |= _profiled(profile)
+        stages |= {"sync": sync, "sampling": share * cycles, "denoise": (1 - share) * cycles}
+    return stages | {"other": total - (sum(stages.values()) - stages["start"])}
+
+
+def _profiled(profile: cProfile.Profile) -> dict[str, float]:
+    rows: dict[tuple[str, int, str], tuple[int, int, float, float, object]] = pstats.Stats(profile).stats  # type: ignore[attr-defined]
+    times = {(Path(file).name, name): row[3] for (file, _, name), row in rows.items()}
+    return {stage: sum(times.get(key, 0.0) for key in keys) for stage, keys in STAGES.items()}
+
+
+def _share_of_sampling(studio: Studio, log: Path, images: int, views: int) -> float:
+    """Of sampling and denoising together: the first view of each drop, rendered with and without denoiser."""
+    seconds = [0.0, 0.0]
+    settings = studio.stage.settings
+    for drop in range(-(-images // views)):
+        spec, settled = studio.drop(drop)
+        with studio.stage.scene(spec, settled) as scene:
+            for k, variant in enumerate([settings.model_copy(update={"denoiser": "none"}), settings]):
+                studio.stage.configure(variant)
+                scene.render(0)
+                seconds[k] += _logged(log)[1]
+                log.unlink()
+    return min(seconds[0] / seconds[1], 1.0)
+
+
+def _logged(log: Path) -> tuple[float, float]:
+    """Cycles' own stages in its log, seconds: until the first sample, and from there until the image is denoised."""
+    before = after = 0.0
+    for minutes, seconds, what in _LINE.findall(log.read_text(errors="replace")):
+        now = 60 * int(minutes) + float(seconds)
+        if what == "Finished":
+            after += now
+        else:
+            before += now
+    return before, after - before
+
+
+if __name__ == "__main__":
+    main()
