@@ -35,6 +35,8 @@ _LICENCES = {
 }
 """Hugging Face's names, and how a recipe's licence text may name the same."""
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
+_SHARDS = "**/shard-*.tar"
+"""What of a folder Hugging Face loads; without this it guesses, and takes the JSON files for the dataset."""
 _TASKS = {"rgb": "keypoint-detection", "masks": "image-segmentation", "depth": "depth-estimation"}
 _FILES = {
     "rgb": ("`rgb/`", "colour, 8 bits"),
@@ -139,6 +141,7 @@ def _front_matter(recipe: Recipe, statistics: Statistics, licence: str) -> str:
         "tags": ["6d-pose-estimation", "bop", "synthetic", "symmetry", "texture-less"],
         "pretty_name": " ".join(recipe.name.split()),
         "size_categories": [size],
+        "configs": [{"config_name": "default", "data_files": [{"split": "train", "path": _SHARDS}]}],
     }
     return f"---\n{yaml.safe_dump(content, sort_keys=False, allow_unicode=True)}---"
 
@@ -150,7 +153,7 @@ def _what(recipe: Recipe, statistics: Statistics, header: Mapping[str, Any]) -> 
         f"# {escape(recipe.name)}\n\n"
         f"{statistics.images} synthetic images with {statistics.instances} instances of {len(statistics.objects)} "
         f"objects ({mean:.1f} an image), for 6D pose estimation of texture-less, symmetric parts. Objects fall onto a "
-        "table and are rendered with Blender Cycles; poses, depth, masks and visibility are exact. Every pose also "
+        "table and are rendered with Blender Cycles; poses, depth and masks are exact. Every pose also "
         "comes with an unambiguous, learnable label: a canonical pose that is the same for all poses that look alike.\n"
         f"\nMade by SyntheT-Less ({versions})."
     )
@@ -198,9 +201,15 @@ def _making(recipe: Recipe) -> str:
         ("table", "procedural textures" if recipe.source.textures == BUILTIN else "photographs"),
         ("lamp", f"{_span(light.elevation_deg)}° above the table, strength {_span(light.strength)}"),
         ("ambient light", _span(light.ambient)),
+        ("visible", _visibility(recipe.labels.visibility_delta_mm)),
         ("samples a pixel", f"{recipe.render.samples}, denoiser {recipe.render.denoiser}"),
     ]
     return f"## How it was made\n\n{_table(('setting', 'value'), rows)}\n\nThe whole recipe is in `dataset.json`."
+
+
+def _visibility(delta_mm: float) -> str:
+    behind = f", or up to {delta_mm:g} mm behind it along the ray, as in BOP" if delta_mm else ""
+    return f"what is the nearest surface{behind}"
 
 
 def _objects(statistics: Statistics, table: SymmetryTable) -> str:
@@ -258,7 +267,9 @@ for sample in webdataset.WebDataset(sorted(glob.glob("shards/shard-*.tar")), sha
 from datasets import load_dataset
 
 images = load_dataset("webdataset", data_files={{"train": "shards/shard-*.tar"}}, split="train", streaming=True)
-```"""
+```
+
+The folder of the shards has a copy of this card: uploaded to the hub, it is loaded by its name alone."""
 
 
 def _terms(recipe: Recipe, licence: str) -> str:

@@ -19,6 +19,7 @@ from generator.config import load_recipe
 from generator.dataset import Dataset
 from generator.formats.bop import ScenePaths, read_scene_json
 from generator.formats.card import CARD_FILE, escape, write_card
+from generator.formats.webdataset import export_webdataset
 from generator.models import load_models
 
 
@@ -53,7 +54,32 @@ def test_front_matter_is_what_hugging_face_reads(copy: Path) -> None:
         "tags": ["6d-pose-estimation", "bop", "synthetic", "symmetry", "texture-less"],
         "pretty_name": "synthetless",
         "size_categories": ["n<1K"],
+        "configs": [{"config_name": "default", "data_files": [{"split": "train", "path": "**/shard-*.tar"}]}],
     }
+
+
+@pytest.mark.parametrize("folder", ["shards", "dataset"])
+def test_hugging_face_loads_a_folder_by_its_card(
+    copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str
+) -> None:
+    """The shards alone, as they are uploaded, and a dataset's folder that has them somewhere in it."""
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    datasets = pytest.importorskip("datasets", reason="datasets is not installed; extra 'interop' has it")
+    write_card(copy)
+    export_webdataset(copy, copy / "shards", workers=1)
+    place = {"shards": copy / "shards", "dataset": copy}[folder]
+    loaded = datasets.load_dataset(str(place), split="train", cache_dir=str(tmp_path / "cache"))
+    assert len(loaded) == valid_dataset.IMAGES
+    assert {"rgb.png", "depth.png", "gt.json", "gt_canonical.json"} <= set(loaded.column_names)
+
+
+def test_the_card_says_what_visible_means(copy: Path) -> None:
+    assert "| visible | what is the nearest surface |" in _card(copy)[1]
+    path = copy / "dataset.json"
+    header = json.loads(path.read_text())
+    header["recipe"]["labels"]["visibility_delta_mm"] = 5
+    path.write_text(json.dumps(header))
+    assert "| visible | what is the nearest surface, or up to 5 mm behind it" in _card(copy)[1]
 
 
 def test_statistics_are_counted(copy: Path) -> None:
