@@ -233,8 +233,14 @@ def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def made_before(demo: Path, tless: Path, models: Path, dtd: Path) -> dict[str, Callable[[Path], object]]:
-    """What pages take for granted where they name it before they make it, and how it comes into a reader's folder."""
+def made_before(request: pytest.FixtureRequest) -> dict[str, Callable[[Path], object]]:
+    """What pages take for granted where they name it, and how it comes into a reader's folder."""
+
+    def copy_of(fixture: str) -> Callable[[Path], object]:
+        return lambda place: shutil.copytree(request.getfixturevalue(fixture), place)
+
+    def link_to(fixture: str) -> Callable[[Path], object]:
+        return lambda place: linked(place, request.getfixturevalue(fixture))
 
     def bop_dataset(place: Path) -> None:
         scene = place / "train_primesense" / "000001"
@@ -248,12 +254,12 @@ def made_before(demo: Path, tless: Path, models: Path, dtd: Path) -> dict[str, C
         place.write_text("object 5: {group: C2}\n", encoding="utf-8")
 
     return {
-        "T-LESS/models_cad": partial(linked, target=models),
-        "DTD/images": partial(linked, target=dtd),
-        "out/demo": partial(shutil.copytree, demo),
-        "tless": partial(shutil.copytree, tless),
+        "T-LESS/models_cad": link_to("models"),
+        "DTD/images": link_to("dtd"),
+        "out/demo": copy_of("demo"),
+        "tless": copy_of("tless"),
         "BOP/tless": bop_dataset,
-        "DIR": partial(shutil.copytree, demo),  # docs/symmetry.md
+        "DIR": copy_of("demo"),  # docs/symmetry.md
         "my.yaml": table,  # docs/symmetry.md
     }
 
@@ -281,6 +287,45 @@ def test_a_page_can_be_followed(
         reader.follow(block)
     if reader.not_possible:
         pytest.skip("all but: " + "; ".join(reader.not_possible))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "```sh\nfalse\n```\n",
+        "```sh\nmissing-program --help\n```\n",
+        "```sh\nfalse | cat\n```\n",
+        "```sh\ntrue \\\n  --option | grep nothing\n```\n",
+        "```sh\ntrue  # a comment\necho $UNSET\n```\n",
+        "```console\n$ echo one\ntwo\n```\n",
+        "```console\n$ echo synthetless: refused\nsynthetless: refused\n```\n",
+        "```python\nassert 1 + 1 == 3\n```\n",
+        "```pycon\n>>> 1 + 1\n3\n```\n",
+    ],
+)
+def test_a_false_page_is_found(text: str, tmp_path: Path) -> None:
+    (block,) = blocks(text)
+    with pytest.raises(AssertionError):
+        Reader(tmp_path, {}).follow(block)
+
+
+def test_a_true_page_is_followed(tmp_path: Path) -> None:
+    page = """
+```sh
+echo "one  two" \\
+    > file.txt        # a comment
+```
+```console
+$ cat file.txt
+one two
+$ (echo synthetless: refused; exit 2)
+synthetless: ...fused
+```
+"""
+    reader = Reader(tmp_path, {})
+    for block in blocks(page):
+        reader.follow(block)
+    assert (tmp_path / "file.txt").read_text() == "one  two\n"
 
 
 @pytest.mark.blender
