@@ -212,10 +212,13 @@ class _Crew:
 
     def _give_up_hung(self) -> Iterator[Outcome]:
         limit_s, now = self._place.drop_limit_s, time.monotonic()
-        for ref, call in list(self._calls.items()):
-            if call.job and now - call.since > limit_s:
-                del self._calls[ref]
-                self._ray.kill(call.worker)
+        late = [ref for ref, call in self._calls.items() if call.job and now - call.since > limit_s]
+        if not late:
+            return
+        for ref in self._ray.wait(late, num_returns=len(late), timeout=0)[1]:  # but for answers still to be read
+            call = self._calls.pop(ref)
+            self._ray.kill(call.worker)
+            if call.job:
                 yield Outcome(call.job, failure=f"took longer than {limit_s:g} s")
 
 
