@@ -130,7 +130,9 @@ def settings(group: type[Settings] = Recipe, prefix: str = "") -> Iterator[Setti
         if isinstance(kind, type) and issubclass(kind, Settings):
             inner.append((key, kind))
         else:
-            yield Setting(key, _kind(kind, field.metadata), field.get_default(), field.description or "")
+            yield Setting(
+                key, _kind(kind, field.metadata), field.get_default(), " ".join((field.description or "").split())
+            )
     for key, kind in inner:
         yield from settings(kind, f"{key}.")
 

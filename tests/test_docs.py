@@ -55,10 +55,10 @@ NOT_RUN = (
     (r"make setup( PYTHON=.*)?", "makes the environment that this test runs in"),
     (r"source \.venv/bin/activate", "a page's commands find the environment's programs already"),
     (r"sudo (make system-libraries|apt-get .*)", "installs packages, as root"),
-    (
-        r"synthetless --install-completion",
-        "writes into the reader's home; see test_completion.py",
-    ),
+    (r"sbatch .*", "needs SLURM"),
+    (r"ray (start|stop).*|.* --executor ray .*", "would stop every Ray on this machine; see test_cluster.py"),
+    (r"ray (up|exec|attach|down|rsync-up|rsync-down) .*", "rents machines"),
+    (r"synthetless --install-completion", "writes into the reader's home; see test_completion.py"),
 )
 """Commands that are not run, and why. A new command that is not listed here is run, and has to work."""
 
@@ -68,6 +68,8 @@ GENERATE_TLESS = (
 
 LANGUAGES = {"", "sh", "bash", "console", "python", "pycon", "yaml", "json", "text"}
 """A block in another one would be overlooked."""
+
+PROGRAMS = r"^(\$ )?(synthetless|make|python|pip|sudo|sbatch|ray|curl|wget) "
 
 
 @dataclass(frozen=True)
@@ -257,6 +259,8 @@ def made_before(request: pytest.FixtureRequest) -> dict[str, Callable[[Path], ob
         "T-LESS/models_cad": link_to("models"),
         "DTD/images": link_to("dtd"),
         "out/demo": copy_of("demo"),
+        "out/demo_gpu": copy_of("demo"),  # docs/scaling.md; the recipe is the same
+        "out/parts": copy_of("demo"),  # docs/scaling.md, likewise
         "tless": copy_of("tless"),
         "BOP/tless": bop_dataset,
         "DIR": copy_of("demo"),  # docs/symmetry.md
@@ -353,10 +357,12 @@ def test_a_page_has_only_blocks_that_are_understood(name: str) -> None:
     assert len(found) * 2 == len(re.findall(r"^\s*(```|~~~)", text, re.MULTILINE)), "an indented or unfinished block"
     assert {block.language for block in found} <= LANGUAGES
     for block in found:
-        if block.language == "":
-            assert not re.search(r"^(\$ )?(synthetless|make|python|pip) ", block.text, re.MULTILINE), "use ```sh"
+        if block.language in ("", "text"):
+            assert not re.search(PROGRAMS, block.text, re.MULTILINE), "commands stand in ```sh"
         if block.language == "yaml":
             yaml.safe_load(block.text)
+    for row in re.findall(r"^\|.*$", text, re.MULTILINE):
+        assert row.endswith("|"), f"a table row without an end: {row}"
 
 
 @pytest.mark.parametrize("name", PAGES)
