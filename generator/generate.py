@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from generator.dataset import DATASET_FILE, Dataset
 from generator.device import CPU, Devices
 from generator.formats import bop
 from generator.formats.files import write_json
-from generator.locks import locked
+from generator.locks import in_turn, locked
 from generator.plan import Part, by_drop, plan_image
 from generator.replay import read_recipe
 from generator.review.sheet import write_contact_sheet
@@ -28,7 +29,7 @@ from scenes.sampling import sample_scene
 
 FAILURES_FOLDER = ".failures"
 SHEET_FILE = "preview.jpg"
-_DROPS_BETWEEN_ASSEMBLIES = 50
+_BETWEEN_ASSEMBLIES_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -157,14 +158,16 @@ def _make(dataset: Dataset, sources: Sources, missing: list[int], execution: Exe
     interval = 0.5 if sys.stderr.isatty() else 60.0
     next_sheet: float = 1 if execution.preview_every else math.inf
     with tqdm(total=len(missing), unit="image", mininterval=interval, maxinterval=interval, smoothing=0.05) as bar:
-        for count, outcome in enumerate(_outcomes(dataset, jobs, execution), start=1):
+        assembled = time.monotonic()
+        for outcome in _outcomes(dataset, jobs, execution):
             bar.update(outcome.made)
             _note_failure(dataset, sources, outcome)
             if outcome.failure:
                 failures.append(outcome)
                 bar.set_postfix(failed=len(failures))
-            if count % _DROPS_BETWEEN_ASSEMBLIES == 0 or bar.n >= next_sheet:
+            if bar.n >= next_sheet or time.monotonic() - assembled > _BETWEEN_ASSEMBLIES_S:
                 dataset.assemble()
+                assembled = time.monotonic()
             if bar.n >= next_sheet:
                 _draw_sheet(dataset)
                 next_sheet = bar.n + execution.preview_every
@@ -180,7 +183,8 @@ def _outcomes(dataset: Dataset, jobs: list[Job], execution: Execution) -> Iterat
 
 def _draw_sheet(dataset: Dataset) -> None:
     if "rgb" in dataset.recipe.outputs:
-        write_contact_sheet(dataset.root, dataset.root / SHEET_FILE, dataset.recipe.split)
+        with in_turn(dataset.root):  # or the sheet of another part, drawn of fewer images, might come last
+            write_contact_sheet(dataset.root, dataset.root / SHEET_FILE, dataset.recipe.split)
 
 
 def _note_failure(dataset: Dataset, sources: Sources, outcome: Outcome) -> None:

@@ -30,7 +30,8 @@ FAULT_VARIABLE = "SYNTHETLESS_FAULTS"
 LOGS_FOLDER = ".logs"
 _RENEW = 75
 """Exit code of a worker that asks to be replaced because its memory has grown."""
-_GROWTH_LIMIT = 1.5e9  # bytes
+GROWTH_LIMIT_BYTES = 1.5e9
+"""A worker that has grown by so much is replaced."""
 
 
 @dataclass(frozen=True)
@@ -132,9 +133,9 @@ def _outcome(future: Future[Outcome], job: Job, place: Workplace) -> Outcome | N
 
 def _make(place: Workplace, job: Job) -> Outcome:
     """In the worker: make and commit the images of one drop."""
-    _inject_fault(job.drop)
+    inject_fault(job.drop)
     dataset, studio = Dataset(place.root, place.recipe), _studio(place)
-    if psutil.Process().memory_info().rss > _memory_at_start(place) + _GROWTH_LIMIT:
+    if psutil.Process().memory_info().rss > _memory_at_start(place) + GROWTH_LIMIT_BYTES:
         os._exit(_RENEW)
     made = 0
     try:
@@ -169,7 +170,8 @@ def _memory_at_start(place: Workplace) -> int:
     return rss
 
 
-def _inject_fault(drop: int) -> None:
+def inject_fault(drop: int) -> None:
+    """Do to this worker what FAULT_VARIABLE asks for at this drop."""
     faults = dict(item.split(":") for item in os.environ.get(FAULT_VARIABLE, "").split(",") if item)
     kind = next((kind for kind, number in faults.items() if int(number) == drop), "")
     if kind == "abort":

@@ -145,7 +145,7 @@ class TableSettings(Settings):
 
 QUALITIES: dict[str, dict[str, Any]] = {
     "draft": {"samples": 4, "denoiser": "fast"},
-    "standard": {"samples": 12, "denoiser": "accurate"},
+    "standard": {"samples": 12, "denoiser": "fast"},
     "reference": {"samples": 256, "denoiser": "accurate"},
 }
 """What the named qualities stand for; how near each comes to a converged render is in docs/scaling.md."""
@@ -159,7 +159,7 @@ class RenderSettings(Settings):
     samples: Annotated[int, Bounds(1, 65536, "samples")] = QUALITIES["standard"]["samples"]
     """Light paths per pixel; if not given, those of the quality."""
     denoiser: Literal["none", "fast", "accurate"] = QUALITIES["standard"]["denoiser"]
-    """Open Image Denoise: none, fast (small network, raw guides), accurate (large, prefiltered); if not given, the
+    """Open Image Denoise: none, fast (smaller network), accurate (larger, prefiltered guides); if not given, the
     quality's."""
     bounces: Annotated[int, Bounds(0, 128, "bounces")] = 3
     """Reflections of light between surfaces."""

@@ -15,9 +15,11 @@ import numpy as np
 import pytest
 
 from generator.annotation import PosedModel
+from generator.config import load_recipe
 from generator.formats import bop
 from generator.formats.bop import ScenePaths
 from generator.formats.files import read_json
+from generator.generate import Execution, generate
 from generator.models import load_models
 from generator.raycast import RayCaster
 from generator.replay import read_recipe, read_recorded
@@ -239,3 +241,21 @@ def test_the_canonical_pose_has_the_silhouette_of_the_true_pose(dataset: Path) -
                 silhouettes.append(caster.annotate(camera, None, [posed]).instances[0].mask)
             union = (silhouettes[0] | silhouettes[1]).sum()
             assert (silhouettes[0] & silhouettes[1]).sum() / union >= 0.999, (im_id, entry["obj_id"])
+
+
+def test_the_contact_sheet_is_drawn_soon_and_now_and_then(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After the first drop, and whenever two more images are there; three drops of two views each."""
+    drawn: list[int] = []
+
+    def draw(dataset: Path, to: Path, split: str) -> None:
+        drawn.append(read_json(dataset / "dataset.json")["counts"]["images"])
+
+    monkeypatch.setattr("generator.generate.write_contact_sheet", draw)
+    small = load_recipe(recipe, ["outputs=[rgb]", "render.samples=1"])
+    generate(small, tmp_path / "d", Execution(workers=1, preview_every=2))
+    assert drawn == [2, 4, 6, 6]
+    drawn.clear()
+    generate(small.model_copy(update={"images": 8}), tmp_path / "d", Execution(workers=1))
+    assert drawn == [8]

@@ -18,7 +18,7 @@ from generator.device import Devices, choose
 from generator.formats.files import atomic_write
 from generator.sources import Sources
 from generator.studio import DropFailed, Studio
-from generator.workers import _GROWTH_LIMIT, FAULT_VARIABLE, LOGS_FOLDER, Job, Workplace, _inject_fault
+from generator.workers import FAULT_VARIABLE, GROWTH_LIMIT_BYTES, LOGS_FOLDER, Job, Workplace, inject_fault
 from scenes.blender import BlenderError, RenderDevice
 
 
@@ -120,7 +120,7 @@ class Worker:
             raise BlenderError(f"node {desk.node}: {error}") from None
         except ValueError as error:
             raise ValueError(f"node {desk.node}: {error}") from None
-        self._memory_limit = psutil.Process().memory_info().rss + _GROWTH_LIMIT
+        self._memory_limit = psutil.Process().memory_info().rss + GROWTH_LIMIT_BYTES
         return desk
 
     def make(self, job: Job) -> Delivery:
@@ -132,7 +132,7 @@ class Worker:
         images: list[FinishedImage] = []
         made, failure = 0, ""
         try:
-            _inject_fault(job.drop)
+            inject_fault(job.drop)
             for image in self._studio.make(job.drop, job.images):
                 if self._dataset is None:
                     images.append(image)
