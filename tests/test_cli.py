@@ -6,6 +6,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 
 import cv2
@@ -162,3 +163,39 @@ def test_without_arguments_the_commands_are_listed(run: Run) -> None:
     _, stdout, stderr = run()
     assert "generate" in stdout + stderr
     assert "render" in stdout + stderr
+
+
+def test_no_summary_of_a_command_is_cut(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    for group in ([], ["export"], ["symmetries"]):
+        code, out, _ = run(*group, "--help")
+        assert code == 0
+        commands = out.partition("Commands:")[2].splitlines()
+        assert len(commands) > 2
+        assert not [line for line in commands if line.rstrip().endswith(("...", "…"))]
+
+
+def test_help_fits_eighty_columns(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    for command in ("generate", "preview", "validate", "relabel", "adopt", "fetch", "doctor", "render", "redo"):
+        _, out, _ = run(command, "--help")
+        assert max(map(len, out.splitlines())) <= 80
+
+
+def test_the_version_is_told(run: Run) -> None:
+    assert run("--version")[:2] == (0, f"synthetless {version('synthetless')}\n")
+
+
+def test_requests_that_contradict_themselves(run: Run, inputs: Path, tmp_path: Path) -> None:
+    begin = ("generate", inputs / "recipe.yaml", "--models", inputs / "models", "--out", tmp_path / "out")
+    for options, expected in (
+        (["--address", "auto"], "--executor ray"),
+        (["--executor", "ray", "--dry-run"], "--dry-run"),
+        (["--device", "metal"], "--device metal"),
+        (["--part", "3/2"], "3/2"),
+    ):
+        code, _, err = run(*begin, *options)
+        assert code == 2
+        assert expected in err
+        assert len(err.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
