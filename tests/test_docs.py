@@ -282,8 +282,9 @@ def test_a_page_can_be_followed(
     sources = {"tless": "tless_models", "dtd": "dtd", "part": "part"}
     reader = Reader(tmp_path, {key: partial(request.getfixturevalue, value) for key, value in sources.items()})
     said = "\n".join(block.text for block in page)
+    has_tless = request.getfixturevalue("models") != request.getfixturevalue("builtin_models")
     for place, make in made_before.items():
-        is_fetched = f"--to {place.partition('/')[0]}\n" in said
+        is_fetched = f"--to {place.partition('/')[0]}\n" in said and (place != "T-LESS/models_cad" or has_tless)
         if re.search(rf"(?<![\w/]){re.escape(place)}(?!\w)", said) and not is_fetched:
             (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
             make(tmp_path / place)
