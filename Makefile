@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries demo test lint format parts docs bench clean
+.PHONY: help setup system-libraries demo test interop lint format parts docs bench clean
 
 help:  ## this menu
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-18s %s\n", $$1, $$2}'
@@ -25,6 +25,10 @@ demo: setup  ## a small dataset of the built-in parts, in out/demo
 
 test: setup  ## every test, real renders included
 	$(BIN)/pytest
+
+interop: setup  ## the exports in trainers' own loaders: Hugging Face datasets, torch, torchvision (installs 1.3 GB)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[interop]'
+	$(BIN)/pytest tests/formats
 
 lint: setup  ## ruff and mypy --strict
 	$(BIN)/ruff check .

@@ -60,8 +60,8 @@ class LabelSettings(Settings):
 
     scheme: Literal["pitteri2019", "atlas"] = "pitteri2019"
     """Canonical map and regressor index: the paper's, or the atlas that has no jumps."""
-    visibility_delta_mm: Annotated[float, Bounds(0, 100, "mm")] = 0.0
-    """A surface this close behind another still counts as visible; 0 is exact."""
+    visibility_delta_mm: Annotated[float, Bounds(0, 100, "mm")] = 5.0
+    """A surface this close behind another still counts as visible, as in BOP's synthetic sets; 0 is exact."""
 
 
 class Recipe(SceneSettings):

@@ -179,6 +179,8 @@ class Studio:
             "normals" in recipe.outputs,
             "object_coordinates" in recipe.outputs,
         )
+        if "depth" in recipe.outputs:
+            annotation = annotation.where_valid(images.has_depth(annotation.depth_mm, recipe.encoding.depth_scale))
         inside = [n for n, instance in enumerate(annotation.instances) if instance.mask.any()]
         shown = [list(models)[n] for n in inside]
         return [models[number] for number in shown], shown, annotation.restricted(inside)

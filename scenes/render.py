@@ -172,7 +172,7 @@ def _configure(scene: Any, settings: RenderSettings) -> None:
     cycles.denoiser = "OPENIMAGEDENOISE"
     cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
     cycles.denoising_use_gpu = cycles.device == "GPU"
-    cycles.denoising_quality = "BALANCED" if settings.denoiser == "fast" else "HIGH"
+    cycles.denoising_quality = "HIGH"
     cycles.denoising_prefilter = "NONE" if settings.denoiser == "fast" else "ACCURATE"
     scene.render.use_persistent_data = False  # it would show the previous scene's texture again
     scene.render.image_settings.file_format = "OPEN_EXR"

@@ -159,8 +159,8 @@ class RenderSettings(Settings):
     samples: Annotated[int, Bounds(1, 65536, "samples")] = QUALITIES["standard"]["samples"]
     """Light paths per pixel; if not given, those of the quality."""
     denoiser: Literal["none", "fast", "accurate"] = QUALITIES["standard"]["denoiser"]
-    """Open Image Denoise: none, fast (smaller network), accurate (larger, prefiltered guides); if not given, the
-    quality's."""
+    """Open Image Denoise with albedo and normal guides: none, fast (guides as they are), accurate (guides denoised
+    first); if not given, the quality's."""
     bounces: Annotated[int, Bounds(0, 128, "bounces")] = 3
     """Reflections of light between surfaces."""
     exposure: Annotated[FloatRange, Bounds(0.01, 0.99)] = (0.15, 0.7)

@@ -23,6 +23,7 @@ from generator.generate import Execution, generate
 from generator.models import load_models
 from generator.raycast import RayCaster
 from generator.replay import read_recipe, read_recorded
+from generator.review.validate import validate
 from generator.workers import FAULT_VARIABLE
 from scenes.spec import Intrinsics
 
@@ -259,3 +260,13 @@ def test_the_contact_sheet_is_drawn_soon_and_now_and_then(
     drawn.clear()
     generate(small.model_copy(update={"images": 8}), tmp_path / "d", Execution(workers=1))
     assert drawn == [8]
+
+
+def test_what_is_too_far_for_the_depth_image_has_no_valid_pixel(recipe: Path, tmp_path: Path) -> None:
+    far = ["images=1", "camera.distance_m=[8, 9]", "camera.fx=1700", "camera.fy=1700", "outputs=[depth, masks]"]
+    generate(load_recipe(recipe, [*far, "camera.views_per_drop=1"]), tmp_path / "d", Execution(workers=1))
+    (entries,) = bop.read_scene_json(ScenePaths.of(tmp_path / "d", 1).scene_gt_info).values()
+    assert [entry["px_count_valid"] for entry in entries] == [0] * len(entries)
+    assert max(entry["px_count_visib"] for entry in entries) > 100
+    found = validate(tmp_path / "d")
+    assert found.valid, found.lines()

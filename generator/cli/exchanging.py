@@ -13,6 +13,8 @@ from generator.fetch import fetch
 from generator.formats.coco import export_coco
 from generator.formats.webdataset import export_webdataset, relabel_webdataset
 
+SplitOption = Annotated[str | None, typer.Option(metavar="NAME", help="Folder of images, where there are several.")]
+
 
 def fetch_command(
     what: Annotated[Literal["tless", "dtd"], typer.Argument(help="T-LESS CAD models, or Describable Textures.")],
@@ -37,12 +39,13 @@ def coco_command(
     boxes: Annotated[
         Literal["visible", "amodal"], typer.Option(help="Around the visible pixels, or around the whole object.")
     ] = "visible",
+    split: SplitOption = None,
 ) -> None:
     """Write one COCO file for the whole split.
 
     Canonical poses, and box corners as keypoints, are in it.
     """
-    print(f"{export_coco(dataset, to, boxes=boxes)} images in {to}")
+    print(f"{export_coco(dataset, to, split, boxes)} images in {to}")
 
 
 def webdataset_command(
@@ -51,14 +54,15 @@ def webdataset_command(
     images_per_shard: Annotated[int, typer.Option(min=1, metavar="N", help="Images in a shard, at most.")] = 1000,
     shuffle_seed: Annotated[int | None, typer.Option(metavar="N", help="Shuffle the images by this seed.")] = None,
     relabel_only: Annotated[bool, typer.Option("--relabel-only", help="Renew the labels of existing shards.")] = False,
+    split: SplitOption = None,
 ) -> None:
     """Write BOP webdataset shards.
 
     The labels are in .gt_canonical.json.
     """
     if relabel_only:
-        relabel_webdataset(dataset, to)
+        relabel_webdataset(dataset, to, split)
         print(f"labels renewed in {to}")
         return
-    shards = export_webdataset(dataset, to, images_per_shard=images_per_shard, shuffle_seed=shuffle_seed)
+    shards = export_webdataset(dataset, to, split, images_per_shard, shuffle_seed)
     print(f"{len(shards)} images in {len(set(shards.values()))} shards in {to}")

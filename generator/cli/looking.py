@@ -35,7 +35,9 @@ def preview_command(
     to: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder of the pages; default: preview, inside the dataset.")
     ] = None,
-    split: Annotated[str | None, typer.Option(help="Folder of images, where there are several.")] = None,
+    split: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Folder of images, where there are several.")
+    ] = None,
     images: Annotated[int | None, typer.Option(min=1, metavar="N", help="Show at most so many, evenly spread.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, metavar="N", help="Processes; default: one per core.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the statistics as JSON.")] = False,

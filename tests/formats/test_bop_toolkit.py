@@ -69,7 +69,7 @@ def toolkit(tmp_path_factory: pytest.TempPathFactory) -> Toolkit:
 @pytest.fixture(scope="module")
 def parts(toolkit: Toolkit, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The built-in parts; visibility is exact."""
-    return _generate("builtin", tmp_path_factory.mktemp("parts") / "d")
+    return _generate("builtin", tmp_path_factory.mktemp("parts") / "d", "labels.visibility_delta_mm=0")
 
 
 @pytest.fixture(scope="module", params=["exact, built-in parts", "within 15 mm, T-LESS"])

@@ -44,6 +44,7 @@ RECIPE = (
     "camera.elevation_deg=[35, 80]",
     "camera.views_per_drop=2",
     "objects.count=[4, 6]",
+    "labels.visibility_delta_mm=0",
     "source.licence=CC0 1.0, made for the tests",
 )
 TURNS = {1: [], 2: [np.diag([1, -1, -1])], 3: [np.diag([-1, -1, 1])]}
