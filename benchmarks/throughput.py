@@ -81,8 +81,12 @@ def measure(recipe: Recipe, images: int, wanted: str) -> dict[str, float]:
         began = time.perf_counter()
         studio = Studio(recipe, sources, 1, take_device(device.choose(wanted)), log)
         stages = {"start": time.perf_counter() - began}
-        for drop in range(-(-images // views)):  # colliders are made once for each model, whatever the number of images
-            studio.drop(drop)
+        # What is made once for each model, whatever the number of images, is made now.
+        studio.stage.configure(recipe.render.model_copy(update={"samples": 1, "denoiser": "none"}))
+        for drop in range(-(-images // views)):
+            list(studio.make(drop, [plan_image(drop * views, views)]))
+        studio.stage.configure(recipe.render)
+        log.unlink()
 
         profile = cProfile.Profile()
         began = time.perf_counter()
