@@ -49,7 +49,7 @@ def start(threads: int = 0, device: RenderDevice = CPU) -> Any:
     """
     try:
         with console_to(Path(os.devnull)), _one_core() if threads == 1 else contextlib.nullcontext():
-            import bpy  # it complains of audio devices that a server does not have
+            bpy = module()  # it complains of audio devices that a server does not have
     except ModuleNotFoundError:
         raise BlenderError("Blender is not installed; run: pip install 'synthetless[blender]'") from None
     except ImportError as error:
@@ -61,6 +61,22 @@ def start(threads: int = 0, device: RenderDevice = CPU) -> Any:
         render.threads = threads
     if device.kind != "cpu":
         _compute_on(bpy, device)
+    return bpy
+
+
+def module() -> Any:
+    """Import bpy, and put the folders that it adds to the module search path last.
+
+    It puts them first, and one of them holds an inner package that is called bpy, too: a process spawned from this one
+    inherits the path, and would import that.
+
+    Raises:
+        ImportError: it is not installed, or a shared library is missing.
+    """
+    import bpy
+
+    own = bpy.utils.resource_path("LOCAL")
+    sys.path.sort(key=lambda place: place.startswith(own))  # the others keep their order
     return bpy
 
 

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from scenes import blender
+
 Array = NDArray[np.float64]
 
 _FRAMES_PER_SECOND = 24
@@ -36,9 +38,7 @@ class RigidWorld:
         steps_per_second: int,
         iterations: int,
     ) -> None:
-        import bpy
-
-        self._bpy = bpy
+        bpy = self._bpy = blender.module()
         self._scale, self._margin = scale, margin_m * scale
         self._friction, self._restitution = math.sqrt(friction), restitution  # Bullet multiplies both bodies' values
         self._damping = linear_damping, angular_damping

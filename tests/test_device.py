@@ -99,3 +99,28 @@ bpy.ops.render.render(write_still=True)
     done = _python(code, OIDN_VERBOSE="2")
     assert done.returncode == 0, done.stderr
     assert "Threads : 1" in " ".join(done.stdout.split())
+
+
+@pytest.mark.blender
+def test_a_process_that_has_blender_can_spawn_others(tmp_path: Path) -> None:
+    """Blender's own folders hold an inner package bpy, which must not come first for the spawned."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from multiprocessing import get_context\n"
+        "from scenes import blender\n"
+        "def version(): return blender.start(1).app.version_string\n"
+        "if __name__ == '__main__':\n"
+        "    blender.start(1)\n"
+        "    with get_context('spawn').Pool(1) as pool: print(pool.apply(version))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, str(script)],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip().startswith("4.")

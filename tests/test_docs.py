@@ -17,6 +17,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,8 @@ import yaml
 
 from docs.figures.tless import overlay
 
-pytest.importorskip("bpy", reason="the documentation's commands need Blender, extra 'blender'")
+if find_spec("bpy") is None:
+    pytest.skip("the documentation's commands need Blender, extra 'blender'", allow_module_level=True)
 pytest.importorskip("matplotlib", reason="the documentation's commands need matplotlib, extra 'preview'")
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -28,7 +28,7 @@ def test_a_machine_that_renders_is_fit(tmp_path: Path) -> None:
     for name in ("Python", "Blender", "libraries", "devices", "writing", "render"):
         assert checks[name].status == "ok", checks[name]
     assert checks["devices"].value.startswith(("CPU ", "CUDA ", "HIP ", "METAL ", "ONEAPI ", "OPTIX "))
-    assert re.fullmatch(r"\d+\.\d s for an image of 400x400, 16 samples", checks["render"].value)
+    assert re.fullmatch(r"\d+\.\d s for an image of 400x400, \d+ samples", checks["render"].value)
     assert str(tmp_path) in checks["disk"].value
     assert not (tmp_path / "not").exists()
 
