@@ -60,10 +60,11 @@ def recipe(tmp_path_factory: pytest.TempPathFactory) -> Recipe:
 
 
 @pytest.fixture(scope="module")
-def two_nodes() -> Iterator[Any]:
+def two_nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """A cluster of a head and one more node, a core each; nothing of it is left afterwards."""
     from ray.cluster_utils import Cluster
 
+    tmp_path_factory.getbasetemp()  # pytest's own folder must not come to lie in the cluster's
     folder = Path(tempfile.mkdtemp(prefix="ray"))  # short: sockets have short names
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TMPDIR", str(folder))
