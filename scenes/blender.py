@@ -65,18 +65,17 @@ def start(threads: int = 0, device: RenderDevice = CPU) -> Any:
 
 
 def module() -> Any:
-    """Import bpy, and put the folders that it adds to the module search path last.
+    """Import bpy, also in a process that was spawned from one that has it.
 
-    It puts them first, and one of them holds an inner package that is called bpy, too: a process spawned from this one
-    inherits the path, and would import that.
+    Blender puts its script folders first in the module search path, at times again and again, and one of them holds an
+    inner package that is called bpy, too: a spawned process inherits the path, and would import that.
 
     Raises:
         ImportError: it is not installed, or a shared library is missing.
     """
+    sys.path.sort(key=lambda place: Path(place).match("bpy/*/scripts/*"))  # they come last, the others keep their order
     import bpy
 
-    own = bpy.utils.resource_path("LOCAL")
-    sys.path.sort(key=lambda place: place.startswith(own))  # the others keep their order
     return bpy
 
 

@@ -102,15 +102,19 @@ bpy.ops.render.render(write_still=True)
 
 
 @pytest.mark.blender
-def test_a_process_that_has_blender_can_spawn_others(tmp_path: Path) -> None:
+@pytest.mark.parametrize("since", ["", "sys.path[:] = before; blender.start(1)"], ids=["once", "path restored between"])
+def test_a_process_that_has_blender_can_spawn_others(since: str, tmp_path: Path) -> None:
     """Blender's own folders hold an inner package bpy, which must not come first for the spawned."""
     script = tmp_path / "script.py"
     script.write_text(
+        "import sys\n"
         "from multiprocessing import get_context\n"
         "from scenes import blender\n"
         "def version(): return blender.start(1).app.version_string\n"
         "if __name__ == '__main__':\n"
+        "    before = list(sys.path)\n"
         "    blender.start(1)\n"
+        f"    {since}\n"
         "    with get_context('spawn').Pool(1) as pool: print(pool.apply(version))\n"
     )
     done = subprocess.run(
