@@ -6,7 +6,6 @@ What the machine is like, ``generator.machine`` finds out; here it is judged, by
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import sys
 import tempfile
@@ -18,6 +17,7 @@ from typing import Literal
 
 from generator import machine
 from generator.machine import Answer
+from generator.parallel import usable_cores
 
 PYTHON = (3, 11)
 BLENDER = "4.5"
@@ -78,7 +78,7 @@ def examine(folder: Path = Path()) -> tuple[Check, ...]:
         check_blender(machine.blender_version()),
         check_libraries(missing_libraries(machine.blender_library()), machine.unloadable(LOADED_LATER)),
         check_devices(machine.ask(machine.probe("devices"))),
-        check_cores(len(os.sched_getaffinity(0)), machine.core_quota()),
+        check_cores(usable_cores(), machine.core_quota()),
         check_memory(machine.available_memory_bytes()),
         check_disk(shutil.disk_usage(place).free, place),
         check_writable(place),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import sys
 import time
 from collections.abc import Iterator
@@ -19,6 +18,7 @@ from generator.device import CPU, Devices
 from generator.formats import bop
 from generator.formats.files import write_json
 from generator.locks import in_turn, locked
+from generator.parallel import usable_cores
 from generator.plan import Part, by_drop, plan_image
 from generator.replay import read_recipe
 from generator.review.sheet import write_contact_sheet
@@ -77,7 +77,7 @@ class Execution:
     @property
     def processes(self) -> int:
         """How many workers this machine gets: one per core, or per GPU, if not said."""
-        of_machine = len(os.sched_getaffinity(0)) if self.devices.kind == "cpu" else self.devices.count
+        of_machine = usable_cores() if self.devices.kind == "cpu" else self.devices.count
         return self.workers or of_machine
 
 

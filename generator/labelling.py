@@ -5,23 +5,19 @@ from __future__ import annotations
 import gc
 import json
 import os
-import signal
-import threading
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
-from multiprocessing import get_context, parent_process
-from multiprocessing.connection import wait
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from generator.formats.bop import Entry, ScenePaths, read_scene_json
 from generator.formats.files import atomic_write, json_bytes, read_bytes
 from generator.labels import label_scene
+from generator.parallel import each
 from generator.symmetry import SymmetryTable
 
 Labels = dict[int, list[Entry]]
@@ -115,11 +111,7 @@ def label_folders(
         ValueError: a scene folder is damaged; with the file, the image and the instance.
     """
     tasks = [_Task(scene, json.dumps(table.to_dict()), models_info, only) for scene in scenes]
-    processes = min(workers or len(os.sched_getaffinity(0)), len(tasks))
-    with tqdm(total=len(tasks), desc="labels", unit="scene", disable=None) as bar:
-        for labelled in _in_turn(tasks, processes):
-            bar.update()
-            yield labelled
+    return each(_label_folder, tasks, workers, "labels", "scene")
 
 
 def laid_out(labelled: Iterable[LabelledScene], root: Path, draft: Path) -> Iterator[LabelledScene]:
@@ -139,27 +131,19 @@ def laid_out(labelled: Iterable[LabelledScene], root: Path, draft: Path) -> Iter
         yield scene
 
 
-def _in_turn(tasks: Sequence[_Task], processes: int) -> Iterator[LabelledScene]:
-    if processes <= 1:
-        yield from map(_label_folder, tasks)
-        return
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_start_worker) as pool:
-        yield from pool.map(_label_folder, tasks)
+@contextmanager
+def _without_gc() -> Iterator[None]:
+    """Labels hold no reference cycles, and looking for some takes half the time."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
-def _start_worker() -> None:
-    gc.disable()  # labels hold no reference cycles, and looking for some takes half the time
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent's affair
-    threading.Thread(target=_die_with_parent, daemon=True).start()
-
-
-def _die_with_parent() -> None:
-    """An orphan would wait for its next task for ever."""
-    if (parent := parent_process()) is not None:
-        wait([parent.sentinel])
-    os._exit(1)
-
-
+@_without_gc()
 def _label_folder(task: _Task) -> LabelledScene:
     scene = task.scene
     gt, camera = read_scene_json(scene.scene_gt), read_scene_json(scene.scene_camera)

@@ -9,13 +9,10 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import tarfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import groupby
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +24,7 @@ from generator.formats.bop import Entry, ScenePaths, find_split, scene_ids, unco
 from generator.formats.files import atomic_file, atomic_folder, atomic_write, read_bytes, write_json
 from generator.formats.images import decode_mask
 from generator.formats.scene import ImageLabels, read_scene
+from generator.parallel import processes
 
 MAX_IMAGES_PER_SHARD = 1000
 """BOP's limit."""
@@ -155,16 +153,13 @@ def _label_members(labels: ImageLabels) -> Members:
 
 
 def _run(function: Callable[[ShardTask], int], tasks: Sequence[ShardTask], workers: int | None) -> None:
-    """Call ``function`` with every task, in this process or in several; the first error ends it."""
-    processes = min(workers or len(os.sched_getaffinity(0)), len(tasks))
-    with tqdm(total=sum(len(images) for _, images in tasks), desc="shards", unit="image", disable=None) as bar:
-        if processes <= 1:
-            for count in map(function, tasks):
-                bar.update(count)
-        else:
-            with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-                for count in pool.map(function, tasks):
-                    bar.update(count)
+    total = sum(len(images) for _, images in tasks)
+    with (
+        processes(workers, len(tasks)) as run,
+        tqdm(total=total, desc="shards", unit="image", disable=None) as bar,
+    ):
+        for count in run(function, tasks):
+            bar.update(count)
 
 
 def _write_shard(task: ShardTask) -> int:

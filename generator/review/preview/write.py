@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +17,7 @@ from generator.formats.bop import Entry, ScenePaths
 from generator.formats.files import atomic_folder, atomic_write, read_json
 from generator.formats.scene import ImageLabels, read_scene
 from generator.models import INFO_FILE, read_models_info
+from generator.parallel import processes
 from generator.replay import read_recorded
 from generator.review.preview.image import ImageTask, write_image
 from generator.review.preview.pages import PAGE_FILE, is_ours, write_pages, write_statistics
@@ -31,8 +27,6 @@ DEFAULT_FOLDER = "preview"
 _MODELS_FOLDERS = ("models", "models_cad", "models_eval")
 _BATCH = 16  # images that a worker takes at a time
 _WORTH_A_PROCESS = 64  # images; starting one takes a second or two
-
-Write = Callable[[Sequence[ImageTask]], Iterable[str]]
 
 
 def write_preview(
@@ -65,7 +59,7 @@ def write_preview(
     fresh = to.with_name(f".{to.name}.new")
     shutil.rmtree(fresh, ignore_errors=True)
     with atomic_folder(fresh) as folder:
-        _write_images(source, folder, workers or len(os.sched_getaffinity(0)))
+        _write_images(source, folder, workers)
         write_pages(folder, source.title, source.split, source.count)
         names = {obj_id: class_name(obj_id, info) for obj_id, info in source.infos.items()}
         write_statistics(folder, source.title, statistics(dataset, source.split), names)
@@ -147,31 +141,20 @@ class _Source:
                 )
 
 
-def _write_images(source: _Source, folder: Path, workers: int) -> None:
+def _write_images(source: _Source, folder: Path, workers: int | None) -> None:
     index: list[Any] = []
-    processes = min(workers, source.count // _WORTH_A_PROCESS)
-    with _writers(processes) as write, tqdm(total=source.count, desc="preview", unit="image", disable=None) as bar:
+    with (
+        processes(workers, source.count // _WORTH_A_PROCESS) as run,
+        tqdm(total=source.count, desc="preview", unit="image", disable=None) as bar,
+    ):
         for tasks in source.scenes(folder):
-            for _ in write(tasks):
+            for _ in run(write_image, tasks, chunksize=_BATCH):
                 bar.update()
             index += [_index_entry(task) for task in tasks]
     found = sorted({obj_id for _, flat in index for obj_id in flat[::4]})
     classes = [{"id": obj_id, "name": class_name(obj_id, source.infos[obj_id])} for obj_id in found]
     content = json.dumps({"images": index, "classes": classes}, separators=(",", ":"), allow_nan=False)
     atomic_write(folder / "data" / "index.js", f"synthetless.index = {content};\n".encode())
-
-
-@contextmanager
-def _writers(processes: int) -> Iterator[Write]:
-    if processes <= 1:
-        yield lambda tasks: map(write_image, tasks)
-        return
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_ignore_interrupt) as pool:
-        yield lambda tasks: pool.map(write_image, tasks, chunksize=_BATCH)
-
-
-def _ignore_interrupt() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent's affair
 
 
 def _index_entry(task: ImageTask) -> list[Any]:

@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Protocol, TypeVar
-
-from tqdm import tqdm
 
 from generator.dataset import DATASET_FILE
+from generator.parallel import Map, processes, watched
 from generator.review.validate.adopted import AdoptedTask, check_adopted_scene, is_adopted, left_out, read_adopted
 from generator.review.validate.coco_export import check_coco_export
 from generator.review.validate.deep import DeepTask, check_deep, sample
@@ -29,9 +23,6 @@ from generator.review.validate.source import (
     read_source,
 )
 from generator.review.validate.webdataset import Shards, ShardsTask, by_scene, check_companions, check_shards
-
-Task = TypeVar("Task")
-Result = TypeVar("Result")
 
 _DEEP_IMAGES_PER_TASK = 25
 
@@ -72,9 +63,9 @@ def validate(
     plans = plans_by_scene(source.recipe)
     tally.add(check_folders(root, source.recipe, list(plans)))
     n_deep_tasks = math.ceil(min(deep_images, source.recipe.images) / _DEEP_IMAGES_PER_TASK) if deep else 0
-    with _workers(workers, max(len(plans), n_deep_tasks)) as run:
+    with processes(workers, max(len(plans), n_deep_tasks)) as run:
         tasks = [SceneTask(source, scene_id, tuple(of_scene), limit) for scene_id, of_scene in plans.items()]
-        scenes = list(run(check_scene, tasks, "validating"))
+        scenes = list(watched(run, check_scene, tasks, "validating", "part"))
         for scene in scenes:
             tally.merge(scene.tally)
         tally.add(_check_staleness(source, scenes))
@@ -96,37 +87,13 @@ def _validate_adopted(root: Path, deep: bool, exports: tuple[Path, ...], limit: 
     adopted, findings = read_adopted(root, limit)
     tally = Tally(limit)
     tally.add(findings)
-    with _workers(workers, len(adopted.scenes)) as run:
+    with processes(workers, len(adopted.scenes)) as run:
         tasks = [AdoptedTask(adopted, number) for number in range(len(adopted.scenes))]
-        scenes = list(run(check_adopted_scene, tasks, "validating"))
+        scenes = list(watched(run, check_adopted_scene, tasks, "validating", "part"))
     for scene in scenes:
         tally.merge(scene.tally)
     images, instances = sum(len(s.image_ids) for s in scenes), sum(s.instances for s in scenes)
     return _report(root, tally, images, instances, notes=tuple(left_out(adopted)))
-
-
-class _Run(Protocol):
-    """Calls a function with every task, in this process or in several; results in the tasks' order."""
-
-    def __call__(self, function: Callable[[Task], Result], tasks: Sequence[Task], what: str) -> Iterator[Result]: ...
-
-
-@contextmanager
-def _workers(workers: int | None, n_tasks: int) -> Iterator[_Run]:
-    processes = min(workers or len(os.sched_getaffinity(0)), n_tasks)
-
-    def in_this_process(function: Callable[[Task], Result], tasks: Sequence[Task], what: str) -> Iterator[Result]:
-        return (function(task) for task in tqdm(tasks, desc=what, unit="part", disable=None))
-
-    if processes <= 1:
-        yield in_this_process
-        return
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-
-        def in_several(function: Callable[[Task], Result], tasks: Sequence[Task], what: str) -> Iterator[Result]:
-            return iter(tqdm(pool.map(function, tasks), total=len(tasks), desc=what, unit="part", disable=None))
-
-        yield in_several
 
 
 def _require(root: Path, exports: Sequence[Path], limit: int) -> None:
@@ -157,7 +124,7 @@ def _check_staleness(source: Source, scenes: Sequence[SceneResult]) -> Iterator[
         )
 
 
-def _check_deep(source: Source, scenes: Sequence[SceneResult], count: int, run: _Run, tally: Tally) -> tuple[int, int]:
+def _check_deep(source: Source, scenes: Sequence[SceneResult], count: int, run: Map, tally: Tally) -> tuple[int, int]:
     """Cast rays again; returns how many images were compared, and how many could not be."""
     places = sample({scene.scene_id: scene.image_ids for scene in scenes}, count)
     tasks = []
@@ -165,18 +132,18 @@ def _check_deep(source: Source, scenes: Sequence[SceneResult], count: int, run: 
         chunk = places[start : start + _DEEP_IMAGES_PER_TASK]
         images = {scene_id: tuple(im_id for of, im_id in chunk if of == scene_id) for scene_id, _ in chunk}
         tasks.append(DeepTask(source, images, tally.limit))
-    results = list(run(check_deep, tasks, "casting rays"))
+    results = list(watched(run, check_deep, tasks, "casting rays", "part"))
     for result in results:
         tally.merge(result.tally)
     return sum(result.compared for result in results), sum(result.skipped for result in results)
 
 
-def _check_shards(source: Source, scenes: Sequence[SceneResult], folder: Path, run: _Run, tally: Tally) -> None:
+def _check_shards(source: Source, scenes: Sequence[SceneResult], folder: Path, run: Map, tally: Tally) -> None:
     shards = Shards.read(folder)
     members, strangers = by_scene(shards, {scene.scene_id for scene in scenes if scene.image_ids})
     tally.add([*shards.findings, *check_companions(source, folder), *strangers])
     tasks = [ShardsTask(source, scene_id, folder, of, tally.limit) for scene_id, of in members.items()]
-    for result in run(check_shards, tasks, folder.name):
+    for result in watched(run, check_shards, tasks, folder.name, "part"):
         tally.merge(result)
 
 

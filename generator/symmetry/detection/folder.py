@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import signal
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Mapping
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import trimesh
-from tqdm import tqdm
 
 from generator.formats.files import atomic_write, read_json, write_json
+from generator.parallel import each
 from generator.symmetry.atlas import SCHEMES, Scheme
 from generator.symmetry.detection.detect import Detected, Finding, detect
 from generator.symmetry.detection.meshes import find_meshes, read_mesh, unit_warning
@@ -23,9 +19,6 @@ from generator.symmetry.groups import SymmetryGroup
 from generator.symmetry.table import SymmetryEntry, SymmetryTable
 
 INFO_FILE = "models_info.json"
-
-Task = TypeVar("Task")
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -136,31 +129,8 @@ def detect_folder(
         _Task(obj_id, path, tolerance_percent, scale, declared.get(obj_id)) for obj_id, path in files.paths.items()
     ]
     tasks.sort(key=lambda task: -task.path.stat().st_size)  # the longest first, so that no core ends up alone
-    objects = sorted(in_parallel(_detect_file, tasks, workers, "symmetries"), key=lambda o: o.obj_id)
+    objects = sorted(each(_detect_file, tasks, workers, "symmetries", "mesh"), key=lambda o: o.obj_id)
     return DetectedFolder(folder, tuple(objects), files.are_numbered, tolerance_percent, scale)
-
-
-def in_parallel(
-    function: Callable[[Task], Result], tasks: Iterable[Task], workers: int | None, description: str
-) -> Iterator[Result]:
-    """The function's results in the order in which they are done, with a progress bar."""
-    pending = list(tasks)
-    processes = min(workers or len(os.sched_getaffinity(0)), len(pending))
-    with tqdm(total=len(pending), desc=description, unit="mesh", disable=None) as bar:
-        if processes <= 1:
-            for task in pending:
-                yield function(task)
-                bar.update()
-            return
-        with ProcessPoolExecutor(processes, get_context("spawn"), initializer=_ignore_interrupt) as pool:
-            futures = [pool.submit(function, task) for task in pending]
-            try:
-                for future in as_completed(futures):
-                    yield future.result()
-                    bar.update()
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
 
 
 @dataclass(frozen=True)
@@ -170,10 +140,6 @@ class _Task:
     tolerance_percent: float
     scale: float
     declared: SymmetryGroup | None
-
-
-def _ignore_interrupt() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent's affair
 
 
 def _detect_file(task: _Task) -> DetectedObject:

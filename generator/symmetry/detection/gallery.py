@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from generator.parallel import each
 from generator.symmetry.detection.detect import Finding, measure
-from generator.symmetry.detection.folder import DetectedFolder, in_parallel
+from generator.symmetry.detection.folder import DetectedFolder
 from generator.symmetry.detection.meshes import find_meshes, read_mesh
 from generator.symmetry.detection.pictures import picture, write_picture
 from generator.symmetry.groups import SymmetryGroup
@@ -74,7 +75,7 @@ class _Task:
 
 
 def _draw_all(tasks: list[_Task], workers: int | None) -> None:
-    for _ in in_parallel(_draw, tasks, workers, "pictures"):
+    for _ in each(_draw, tasks, workers, "pictures", "mesh"):
         pass
 
 

@@ -1,0 +1,92 @@
+"""Work on many things of a kind, shared out among the cores of this machine."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import wait
+from typing import Protocol, TypeVar
+
+from tqdm import tqdm
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+class Map(Protocol):
+    """Calls a function with every task; the results come in the tasks' order, each as soon as it can."""
+
+    def __call__(
+        self, function: Callable[[Task], Result], tasks: Sequence[Task], chunksize: int = 1
+    ) -> Iterator[Result]: ...
+
+
+def usable_cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+@contextmanager
+def processes(wanted: int | None, most: int) -> Iterator[Map]:
+    """Start processes for the duration, and give the ``map`` that shares work out among them.
+
+    They are spawned, so a script that gets here needs ``if __name__ == "__main__"``. None outlives this process.
+
+    Args:
+        wanted: how many; one per core if None.
+        most: how many have something to do. If that is only one, it is this process.
+
+    Raises:
+        ChildProcessError: one of them was killed.
+    """
+    count = min(wanted or usable_cores(), most)
+    if count <= 1:
+        yield lambda function, tasks, chunksize=1: map(function, tasks)
+        return
+    with ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_begin) as pool:
+
+        def map_in_pool(
+            function: Callable[[Task], Result], tasks: Sequence[Task], chunksize: int = 1
+        ) -> Iterator[Result]:
+            return pool.map(function, tasks, chunksize=chunksize)
+
+        try:
+            yield map_in_pool
+        except BrokenProcessPool:
+            raise ChildProcessError("a worker process was killed, perhaps for lack of memory; run it again") from None
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def each(
+    function: Callable[[Task], Result], tasks: Sequence[Task], workers: int | None, what: str, unit: str
+) -> Iterator[Result]:
+    """The function's results in the tasks' order, with a progress bar; ``workers`` and errors as in ``processes``."""
+    with processes(workers, len(tasks)) as run:
+        yield from watched(run, function, tasks, what, unit)
+
+
+def watched(
+    run: Map, function: Callable[[Task], Result], tasks: Sequence[Task], what: str, unit: str
+) -> Iterator[Result]:
+    """``run(function, tasks)`` with a progress bar."""
+    return iter(tqdm(run(function, tasks), total=len(tasks), desc=what, unit=unit, disable=None))
+
+
+def _begin() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to answer
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """An orphan would wait for its next task for ever."""
+    if (parent := parent_process()) is not None:
+        wait([parent.sentinel])
+    os._exit(1)
