@@ -7,25 +7,20 @@ sampling and denoising is what this project can answer for. Prints a table, writ
 
 from __future__ import annotations
 
-import argparse
 import cProfile
-import json
 import pstats
 import re
 import tempfile
 import time
 from pathlib import Path
 
+from benchmarks import keep, parser, tless_recipe
 from generator import device
-from generator.config import Recipe, load_recipe
+from generator.config import Recipe
 from generator.dataset import Dataset
 from generator.plan import plan_image
 from generator.sources import load_sources
 from generator.studio import Studio
-from generator.workers import take_device
-
-ROOT = Path(__file__).resolve().parents[1]
-RESULT = ROOT / "benchmarks" / "results" / "throughput.json"
 
 STAGES = {
     "sample": [("sampling.py", "sample_scene")],
@@ -43,22 +38,14 @@ _LINE = re.compile(r"^Fra.*Time:(\d+):(\d+\.\d+) .*(Sample 0/|Finished)", re.MUL
 
 def main() -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--models", default="builtin", help="BOP models folder")
-    parser.add_argument("--textures", default="builtin", help="folder of photographs")
-    parser.add_argument("--images", type=int, default=12)
-    parser.add_argument("--views", type=int, default=4, help="images of one drop")
-    parser.add_argument("--quality", default="standard")
-    parser.add_argument("--device", default="cpu")
-    arguments = parser.parse_args()
-    overrides = [
-        "objects.count=[10, 10]",
-        f"camera.views_per_drop={arguments.views}",
-        f"render.quality={arguments.quality}",
-        f"source.models={json.dumps(arguments.models)}",
-        f"source.textures={json.dumps(arguments.textures)}",
-    ]
-    stages = measure(load_recipe(ROOT / "configs" / "tless_bop.yaml", overrides), arguments.images, arguments.device)
+    options = parser(__doc__)
+    options.add_argument("--images", type=int, default=12)
+    options.add_argument("--views", type=int, default=4, help="images of one drop")
+    options.add_argument("--quality", default="standard")
+    options.add_argument("--device", default="cpu")
+    arguments = options.parse_args()
+    settings = [f"camera.views_per_drop={arguments.views}", f"render.quality={arguments.quality}"]
+    stages = measure(tless_recipe(arguments, *settings), arguments.images, arguments.device)
     total = sum(stages.values()) - stages["start"]
     for name, seconds in stages.items():
         share = "" if name == "start" else f"{seconds / total:7.1%}"
@@ -66,9 +53,8 @@ def main() -> None:
     outside = 1 - (stages["sampling"] + stages["denoise"]) / total
     rate = 3600 * arguments.images / total
     print(f"outside Cycles' sampling and denoising: {outside:.1%}; {rate:.0f} images an hour and worker")
-    RESULT.parent.mkdir(exist_ok=True)
     result = {**vars(arguments), "stages_s": stages, "outside_share": outside, "images_per_hour": rate}
-    RESULT.write_text(json.dumps(result, indent=1) + "\n")
+    keep("throughput", result)
 
 
 def measure(recipe: Recipe, images: int, wanted: str) -> dict[str, float]:
@@ -79,7 +65,7 @@ def measure(recipe: Recipe, images: int, wanted: str) -> dict[str, float]:
         sources = load_sources(recipe)
         dataset = Dataset.open(Path(folder) / "dataset", recipe, sources.models, sources.scenery_digest)
         began = time.perf_counter()
-        studio = Studio(recipe, sources, 1, take_device(device.choose(wanted)), log)
+        studio = Studio(recipe, sources, 1, device.take(device.choose(wanted)), log)
         stages = {"start": time.perf_counter() - began}
         # What is made once for each model, whatever the number of images, is made now.
         studio.stage.configure(recipe.render.model_copy(update={"samples": 1, "denoiser": "none"}))

@@ -215,12 +215,17 @@ def _header(recipe: Recipe, models: Mapping[int, ObjectModel], scenery_digest: s
     return {
         "name": recipe.name,
         "recipe": dump_recipe(recipe),
-        "versions": {name: version(name) for name in ("synthetless", "bpy")},
+        "versions": versions(),
         "models_sha256": {str(obj_id): model.digest for obj_id, model in models.items()},
         "scenery_digest": scenery_digest,
         "licence": recipe.source.licence,
         "counts": {"images": 0, "instances": 0},
     }
+
+
+def versions() -> dict[str, str]:
+    """What is installed here of that which pixels depend on."""
+    return {name: version(name) for name in ("synthetless", "bpy")}
 
 
 def _refuse_foreign(root: Path) -> None:

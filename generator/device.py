@@ -6,7 +6,9 @@ from collections import Counter
 from dataclasses import dataclass
 
 from generator import machine
-from scenes.blender import KINDS, BlenderError
+from generator.locks import claim
+from scenes import blender
+from scenes.blender import KINDS, BlenderError, RenderDevice
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,28 @@ def choose(wanted: str) -> Devices:
     if answer.found is None:
         raise BlenderError(f"the devices cannot be listed: {answer.problem}; see `synthetless doctor`")
     return best([device["type"] for device in answer.found["devices"]], wanted)
+
+
+def take(devices: Devices) -> RenderDevice:
+    """The device for this process: the GPUs in turn, so that none waits while another has two workers."""
+    if devices.kind == "cpu":
+        return blender.CPU
+    return RenderDevice(devices.kind, claim(devices.kind) % devices.count)
+
+
+def take_assigned(devices: Devices) -> RenderDevice:
+    """The device for this process of a cluster: the GPU that Ray keeps for it, which sees no other.
+
+    Raises:
+        ValueError: it sees none.
+        BlenderError: as in ``choose``.
+    """
+    if devices.kind == "cpu":
+        return blender.CPU
+    kind = choose(devices.kind).kind
+    if kind == "cpu":
+        raise ValueError("offers a GPU to Ray, but Blender sees none; see `synthetless doctor`")
+    return RenderDevice(kind)
 
 
 def best(seen: list[str], wanted: str) -> Devices:

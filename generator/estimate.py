@@ -7,6 +7,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from generator import device
 from generator.config import Recipe
 from generator.dataset import DATASET_FILE, MODELS_FOLDER, Dataset
 from generator.generate import Execution, wanted
@@ -14,7 +15,6 @@ from generator.machine import nearest_existing
 from generator.plan import IMAGES_PER_SCENE, plan_image
 from generator.sources import Sources, check_photos, load_sources
 from generator.studio import Studio
-from generator.workers import take_device
 
 _PROBES = 2
 
@@ -78,9 +78,10 @@ def estimate(recipe: Recipe, out: Path, execution: Execution) -> Estimate:
         raise ValueError("--dry-run measures this machine; leave out --executor ray")
     sources = load_sources(recipe)
     check_photos(sources)
+    dataset = Dataset(out, recipe)
     if (out / DATASET_FILE).exists():
-        Dataset.open(out, recipe, sources.models, sources.scenery_digest)
-    missing = wanted(Dataset(out, recipe), execution.part)
+        dataset = Dataset.open(out, recipe, sources.models, sources.scenery_digest)
+    done, missing = dataset.done(), wanted(dataset, execution.part)
     views = recipe.camera.views_per_drop
     drops = {plan_image(number, views).drop for number in missing}
     per_drop_s, per_image_s, image_bytes = _measure(recipe, sources, execution, sorted(drops)[:_PROBES])
@@ -89,8 +90,8 @@ def estimate(recipe: Recipe, out: Path, execution: Execution) -> Estimate:
     return Estimate(
         images=len(missing),
         drops=len(drops),
-        existing=len(Dataset(out, recipe).done()),
-        scene_folders=-(-recipe.images // IMAGES_PER_SCENE),
+        existing=len(done),
+        scene_folders=-(-dataset.recipe.images // IMAGES_PER_SCENE),
         views_per_drop=views,
         device=execution.devices.kind,
         workers=execution.processes,
@@ -106,7 +107,7 @@ def _measure(recipe: Recipe, sources: Sources, execution: Execution, drops: list
     """Seconds of a drop, seconds and bytes of an image of it; what is done once only is not counted."""
     if not drops:
         return 0.0, 0.0, 0
-    studio = Studio(recipe, sources, execution.threads, take_device(execution.devices))
+    studio = Studio(recipe, sources, execution.threads, device.take(execution.devices))
     dropping, making, size = 0.0, 0.0, 0
     views = recipe.camera.views_per_drop
     list(studio.make(drops[0], [plan_image(drops[0] * views, views)]))  # so that a GPU has compiled its programs

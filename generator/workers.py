@@ -16,14 +16,14 @@ from pathlib import Path
 import psutil
 from pebble import ProcessExpired, ProcessPool
 
+from generator import device
 from generator.config import Recipe
 from generator.dataset import Dataset, DatasetError
 from generator.device import CPU, Devices
-from generator.locks import claim
 from generator.plan import ImagePlan
 from generator.sources import load_sources
 from generator.studio import DropFailed, Studio
-from scenes.blender import BlenderError, RenderDevice
+from scenes.blender import BlenderError
 
 FAULT_VARIABLE = "SYNTHETLESS_FAULTS"
 """For tests of what survives: "abort:3,hang:5" lets drop 3 kill its worker and drop 5 never end."""
@@ -128,7 +128,7 @@ def _outcome(future: Future[Outcome], job: Job, place: Workplace) -> Outcome | N
             return None
         return Outcome(job, failure=f"its worker died (exit code {death.exitcode})", killed=True)
     except Exception as error:  # whatever one drop stumbles over, the others can be made
-        return Outcome(job, failure=f"{type(error).__name__}: {' '.join(str(error).split())}")
+        return Outcome(job, failure=stumbled(error))
 
 
 def _make(place: Workplace, job: Job) -> Outcome:
@@ -154,20 +154,18 @@ def _studio(place: Workplace) -> Studio:
     logs = place.root / LOGS_FOLDER
     logs.mkdir(exist_ok=True)
     log = logs / f"worker-{os.getpid()}.log"
-    return Studio(place.recipe, load_sources(place.recipe), place.threads, take_device(place.devices), log)
-
-
-def take_device(devices: Devices) -> RenderDevice:
-    """The device for this process: the GPUs in turn, so that none waits while another has two workers."""
-    if devices.kind == "cpu":
-        return RenderDevice()
-    return RenderDevice(devices.kind, claim(devices.kind) % devices.count)
+    return Studio(place.recipe, load_sources(place.recipe), place.threads, device.take(place.devices), log)
 
 
 @lru_cache(maxsize=1)
 def _memory_at_start(place: Workplace) -> int:
     rss: int = psutil.Process().memory_info().rss
     return rss
+
+
+def stumbled(error: Exception) -> str:
+    """What a drop failed of that nobody had thought of, one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 def inject_fault(drop: int) -> None:

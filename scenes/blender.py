@@ -8,9 +8,10 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
-KINDS = ("cpu", "optix", "cuda", "hip", "oneapi", "metal")
+Kind = Literal["cpu", "optix", "cuda", "hip", "oneapi", "metal"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
 """What Cycles can compute on. Of the GPUs, the faster way to use the same one comes first."""
 
 

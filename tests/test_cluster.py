@@ -26,9 +26,9 @@ import pytest
 from generator import cluster, workers
 from generator.cluster import connection, crew
 from generator.cluster.connection import needs_of, room_for
-from generator.cluster.worker import check_versions, versions
+from generator.cluster.worker import check_versions
 from generator.config import Recipe, load_recipe
-from generator.dataset import Dataset
+from generator.dataset import Dataset, versions
 from generator.device import Devices
 from generator.plan import by_drop
 from generator.sources import load_sources

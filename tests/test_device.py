@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 
 from generator import device
-from generator.device import CPU, Devices, best
+from generator.device import CPU, Devices, best, take
 from generator.locks import claim
-from generator.workers import take_device
 from scenes.blender import KINDS, RenderDevice
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -60,8 +59,8 @@ def test_workers_of_one_machine_take_different_gpus(monkeypatch: pytest.MonkeyPa
     code = "from generator.locks import claim; print(claim('optix'))"
     for _ in range(2):
         assert _python(code, TMPDIR=str(tmp_path)).stdout.strip() == "3"
-    assert take_device(Devices("optix", 3)) == RenderDevice("optix", 0)  # the fourth worker shares with the first
-    assert take_device(CPU) == RenderDevice()
+    assert take(Devices("optix", 3)) == RenderDevice("optix", 0)  # the fourth worker shares with the first
+    assert take(CPU) == RenderDevice()
 
 
 @pytest.mark.blender

@@ -44,6 +44,8 @@ def test_a_dry_run_counts_what_is_missing(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "4 to make in 2 drops of 3 views each; 3 are there already" in done.stdout
     assert sorted(out.rglob("*")) == before
+    fewer = _generate(out, "--images", "2", "--dry-run", "--json")
+    assert [json.loads(fewer.stdout)[key] for key in ("images", "existing", "hours")] == [0, 3, 0]
     other = _generate(out, "--seed", "5", "--dry-run")
     assert other.returncode == 2
     assert "seed" in other.stderr

@@ -22,10 +22,11 @@ from generator.generate import SHEET_FILE, Execution, Summary, generate, redo
 from generator.plan import Part
 from generator.replay import render_again
 from generator.studio import DropFailed
+from scenes.blender import Kind
 
 EXIT_FAILED, EXIT_WRONG_REQUEST, EXIT_INTERRUPTED = 1, 2, 130
 
-Device = Literal["auto", "cpu", "optix", "cuda", "hip", "oneapi", "metal"]
+Device = Literal["auto", Kind]
 
 
 def leave(message: str, code: int) -> NoReturn:

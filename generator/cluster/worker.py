@@ -8,18 +8,17 @@ import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 
 import psutil
 
-from generator.dataset import Dataset, DatasetError, FinishedImage
-from generator.device import Devices, choose
+from generator.dataset import Dataset, DatasetError, FinishedImage, versions
+from generator.device import take_assigned
 from generator.formats.files import atomic_write
 from generator.sources import Sources
 from generator.studio import DropFailed, Studio
-from generator.workers import FAULT_VARIABLE, GROWTH_LIMIT_BYTES, LOGS_FOLDER, Job, Workplace, inject_fault
-from scenes.blender import BlenderError, RenderDevice
+from generator.workers import FAULT_VARIABLE, GROWTH_LIMIT_BYTES, LOGS_FOLDER, Job, Workplace, inject_fault, stumbled
+from scenes.blender import BlenderError
 
 
 @dataclass(frozen=True)
@@ -114,7 +113,7 @@ class Worker:
             sources = _with_photos(supplies, photos)
             if sources is None:
                 return replace(desk, lacks_photos=True)
-            device = _device(self._place.devices)
+            device = take_assigned(self._place.devices)
             self._studio = Studio(self._place.recipe, sources, self._place.threads, device, self._log)
         except BlenderError as error:
             raise BlenderError(f"node {desk.node}: {error}") from None
@@ -144,16 +143,11 @@ class Worker:
         except DropFailed as error:
             failure = str(error)
         except Exception as error:  # whatever one drop stumbles over, the others can be made
-            failure = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            failure = stumbled(error)
         return Delivery(made, tuple(images), failure, psutil.Process().memory_info().rss > self._memory_limit)
 
     def answer(self) -> None:
         """Do nothing, when everything that was asked before is done: whoever hears of it knows that this one lives."""
-
-
-def versions() -> dict[str, str]:
-    """What is installed here of that which pixels depend on."""
-    return {name: version(name) for name in ("synthetless", "bpy")}
 
 
 def check_versions(wanted: Mapping[str, str]) -> None:
@@ -165,16 +159,6 @@ def check_versions(wanted: Mapping[str, str]) -> None:
     for name, here in versions().items():
         if here != wanted[name]:
             raise ValueError(f"has {name} {here}, but {wanted[name]} is needed; install the same on every node")
-
-
-def _device(devices: Devices) -> RenderDevice:
-    """The processor, or the GPU that Ray keeps for this worker, which sees no other."""
-    if devices.kind == "cpu":
-        return RenderDevice()
-    kind = choose(devices.kind).kind
-    if kind == "cpu":
-        raise ValueError("offers a GPU to Ray, but Blender sees none; see `synthetless doctor`")
-    return RenderDevice(kind)
 
 
 def _with_photos(supplies: Supplies, photos: Mapping[str, bytes] | None) -> Sources | None:
