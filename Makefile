@@ -46,7 +46,7 @@ docs: setup  ## write docs/recipe.md from the recipe's schema
 	$(BIN)/python -c "from generator.config import recipe_page; print(recipe_page(), end='')" > docs/recipe.md
 
 bench: setup  ## measure (see benchmarks/)
-	@set -e; for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python -m benchmarks.$$(basename $$script .py); done
+	@set -e; for script in benchmarks/[a-z]*.py; do echo "== $$script"; $(BIN)/python -m benchmarks.$$(basename $$script .py); done
 
 clean:  ## remove generated datasets and caches
 	rm -rf out .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -7,7 +7,6 @@ CPU time of this process; of each scene the fastest of a few rounds, since other
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import time
 from collections.abc import Mapping
@@ -16,13 +15,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks import ROOT, keep
 from generator.annotation import PosedModel
 from generator.models import ObjectModel, load_models
 from generator.raycast import Plane, RayCaster
 from scenes.camera import extrinsics
 from scenes.spec import Intrinsics, View
 
-ROOT = Path(__file__).resolve().parents[1]
 CAMERA = Intrinsics(width=720, height=540, fx=1075.65091572, fy=1073.90347929, cx=360.0, cy=270.0)
 HALF_TABLE_MM = 3000.0
 N_OBJECTS, N_SCENES, N_ROUNDS = 10, 20, 8
@@ -62,9 +61,7 @@ def main() -> None:
         "cpu_ms_per_image_median": {name: round(float(value), 1) for name, value in times_ms.items()},
         "cpu_ms_per_model_once_mean": round(build_ms, 1),
     }
-    file = ROOT / "benchmarks" / "results" / "annotate.json"
-    file.parent.mkdir(exist_ok=True)
-    file.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    keep("annotate", result)
 
 
 def _random_scene(rng: np.random.Generator, obj_ids: list[int]) -> Scene:

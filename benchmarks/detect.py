@@ -8,18 +8,17 @@ With --markdown (T-LESS only) it writes docs/symmetry_tless.md, what was found b
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import resource
 import time
 from pathlib import Path
 
+from benchmarks import ROOT, keep
 from generator.formats.files import atomic_write
+from generator.parallel import usable_cores
 from generator.symmetry.detection import Detected, DetectedFolder, DetectedObject, Finding, detect_folder
 from generator.symmetry.detection.report import axis_text
 
-ROOT = Path(__file__).resolve().parents[1]
-RESULT = ROOT / "benchmarks" / "results" / "detect.json"
 PAGE = ROOT / "docs" / "symmetry_tless.md"
 
 INTRODUCTION = """# Symmetries of the T-LESS CAD models: detected and declared
@@ -47,7 +46,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     default = Path(os.environ.get("SYNTHETLESS_TLESS_MODELS", ROOT / "assets" / "parts"))
     parser.add_argument("models", type=Path, nargs="?", default=default, help="a BOP models folder")
-    parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)), help="processes")
+    parser.add_argument("--workers", type=int, default=usable_cores(), help="processes")
     parser.add_argument("--markdown", action="store_true", help="write docs/symmetry_tless.md")
     arguments = parser.parse_args()
 
@@ -64,7 +63,7 @@ def main() -> None:
         "cpu_s": round(cpu, 1),
         "as_declared": agreeing,
     }
-    atomic_write(RESULT, (json.dumps(result, indent=2) + "\n").encode())
+    keep("detect", result)
     if arguments.markdown:
         atomic_write(PAGE, page(detected).encode())
         print(PAGE.relative_to(ROOT))

@@ -7,7 +7,6 @@ Prints a table and writes benchmarks/results/physics.json. Needs Blender.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import time
 from collections import Counter
@@ -16,14 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks import ROOT, keep
 from generator.models import load_models
 from scenes.mesh import Mesh
 from scenes.physics import Collider, NotSettled, PhysicsSettings, collider, settle
 from scenes.rotations import random_rotation
 from scenes.spec import Pose
-
-ROOT = Path(__file__).resolve().parents[1]
-RESULT = Path(__file__).parent / "results" / "physics.json"
 
 
 def main() -> None:
@@ -42,8 +39,7 @@ def main() -> None:
     for count in arguments.objects:
         rows.append(measure(colliders, count, arguments.throws))
         print(", ".join(f"{key} {value}" for key, value in rows[-1].items()))
-    RESULT.parent.mkdir(exist_ok=True)
-    RESULT.write_text(json.dumps(rows, indent=1) + "\n")
+    keep("physics", rows)
 
 
 def measure(colliders: Sequence[Collider], count: int, throws: int) -> dict[str, object]:

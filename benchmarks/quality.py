@@ -9,7 +9,6 @@ of rendering alone. The converged renders are kept in benchmarks/results and use
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from generator.config import Recipe, load_recipe
+from benchmarks import RESULTS, keep, parser, tless_recipe
+from generator.config import Recipe
 from generator.develop import develop, exposure_gain
 from generator.formats.images import decode_rgb, encode_jpeg, encode_png
 from generator.sources import load_sources
@@ -26,8 +26,6 @@ from generator.studio import Studio
 from scenes.render import Stage
 from scenes.settings import RenderSettings
 
-ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ROOT / "benchmarks" / "results"
 SHRINK = 2
 
 Encoder = Callable[[NDArray[np.uint8]], bytes]
@@ -44,13 +42,11 @@ CANDIDATES: dict[str, tuple[RenderSettings, Encoder]] = {
 
 def main() -> None:
     """Render, compare, print a table, write benchmarks/results/quality.json."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--models", default="builtin", help="BOP models folder")
-    parser.add_argument("--textures", default="builtin", help="folder of photographs")
-    parser.add_argument("--scenes", type=int, default=3)
-    parser.add_argument("--samples", type=int, default=4096, help="of the converged renders")
-    arguments = parser.parse_args()
-    recipe = bench_recipe(arguments.models, arguments.textures)
+    options = parser(__doc__)
+    options.add_argument("--scenes", type=int, default=3)
+    options.add_argument("--samples", type=int, default=4096, help="of the converged renders")
+    arguments = options.parse_args()
+    recipe = bench_recipe(arguments)
     studio = Studio(recipe, load_sources(recipe), threads=1)
     rows: dict[str, list[tuple[float, float, float, float]]] = {name: [] for name in CANDIDATES}
     for drop in range(arguments.scenes):
@@ -71,20 +67,17 @@ def main() -> None:
     table = {name: dict(zip(columns, np.mean(row, axis=0).round(4), strict=True)) for name, row in rows.items()}
     for name, row in table.items():
         print(f"{name:32}" + "".join(f"{column} {row[column]:8.3f}   " for column in columns))
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "quality.json").write_text(json.dumps(table, indent=1) + "\n")
+    keep("quality", table)
 
 
-def bench_recipe(models: str, textures: str) -> Recipe:
+def bench_recipe(arguments: argparse.Namespace) -> Recipe:
     """The T-LESS recipe with 10 objects, one view a drop, at a smaller size."""
-    camera = load_recipe(ROOT / "configs" / "tless_bop.yaml").camera
+    camera = tless_recipe(arguments).camera
     smaller = {"width": camera.width // SHRINK, "height": camera.height // SHRINK} | {
         name: getattr(camera, name) / SHRINK for name in ("fx", "fy", "cx", "cy")
     }
     overrides = [f"camera.{name}={value}" for name, value in smaller.items()]
-    overrides += ["objects.count=[10, 10]", "camera.views_per_drop=1"]
-    overrides += [f"source.models={json.dumps(models)}", f"source.textures={json.dumps(textures)}"]
-    return load_recipe(ROOT / "configs" / "tless_bop.yaml", overrides)
+    return tless_recipe(arguments, *overrides, "camera.views_per_drop=1")
 
 
 def converged(

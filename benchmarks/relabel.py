@@ -18,13 +18,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks import ROOT, keep
 from generator.formats.bop import ScenePaths, camera_entry, gt_entry, write_scene_json
 from generator.formats.files import write_json
 from generator.models import INFO_FILE, read_models_info
+from generator.parallel import usable_cores
 from generator.relabel import relabel
 from generator.symmetry import SymmetryTable
 
-ROOT = Path(__file__).resolve().parents[1]
 N_SCENES, N_IMAGES, N_INSTANCES = 30, 1000, 5
 K = np.array([[1075.0, 0.0, 200.0], [0.0, 1075.0, 200.0], [0.0, 0.0, 1.0]])
 
@@ -32,7 +33,7 @@ K = np.array([[1075.0, 0.0, 200.0], [0.0, 1075.0, 200.0], [0.0, 0.0, 1.0]])
 def main() -> None:
     """Measure, print a table, write benchmarks/results/relabel.json."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)), help="processes")
+    parser.add_argument("--workers", type=int, default=usable_cores(), help="processes")
     workers: int = parser.parse_args().workers
     with tempfile.TemporaryDirectory() as folder:
         root, table = Path(folder) / "dataset", Path(folder) / "table.json"
@@ -54,9 +55,7 @@ def main() -> None:
         "wall_s": {name: round(wall_s, 2) for name, (wall_s, _) in times.items()},
         "cpu_s": {name: round(cpu_s, 2) for name, (_, cpu_s) in times.items()},
     }
-    file = ROOT / "benchmarks" / "results" / "relabel.json"
-    file.parent.mkdir(exist_ok=True)
-    file.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    keep("relabel", result)
 
 
 def build(root: Path) -> None:

@@ -8,34 +8,26 @@ else to do: it prints a table and writes benchmarks/results/scaling.json.
 
 from __future__ import annotations
 
-import argparse
-import json
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from generator.config import Recipe, load_recipe
+from benchmarks import keep, parser, tless_recipe
+from generator.config import Recipe
 from generator.dataset import RECORDS_FOLDER
 from generator.generate import Execution, generate
-
-ROOT = Path(__file__).resolve().parents[1]
-RESULT = ROOT / "benchmarks" / "results" / "scaling.json"
 
 
 def main() -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--models", default="builtin", help="BOP models folder")
-    parser.add_argument("--textures", default="builtin", help="folder of photographs")
-    parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 4])
-    parser.add_argument("--images", type=int, default=24)
-    parser.add_argument("--rounds", type=int, default=2)
-    arguments = parser.parse_args()
-    sources = [f"source.{name}={json.dumps(getattr(arguments, name))}" for name in ("models", "textures")]
-    overrides = [*sources, "objects.count=[10, 10]", "camera.views_per_drop=1", f"images={arguments.images}"]
-    overrides.append("objects.ids=[1, 2, 3, 4, 5, 6]")
-    recipe = load_recipe(ROOT / "configs" / "tless_bop.yaml", overrides)
+    options = parser(__doc__)
+    options.add_argument("--workers", type=int, nargs="+", default=[1, 2, 4])
+    options.add_argument("--images", type=int, default=24)
+    options.add_argument("--rounds", type=int, default=2)
+    arguments = options.parse_args()
+    few_models = "objects.ids=[1, 2, 3, 4, 5, 6]"
+    recipe = tless_recipe(arguments, few_models, "camera.views_per_drop=1", f"images={arguments.images}")
     rates: dict[int, list[float]] = {workers: [] for workers in arguments.workers}
     for _ in range(arguments.rounds):
         for workers, measured in rates.items():
@@ -43,8 +35,7 @@ def main() -> None:
     best = {workers: max(measured) for workers, measured in rates.items()}
     for workers, rate in best.items():
         print(f"{workers} workers: {rate:6.0f} images an hour, {rate / best[arguments.workers[0]]:.2f} times the first")
-    RESULT.parent.mkdir(exist_ok=True)
-    RESULT.write_text(json.dumps({"images_per_hour": rates}, indent=1) + "\n")
+    keep("scaling", {"images_per_hour": rates})
 
 
 def images_per_hour(recipe: Recipe, workers: int) -> float:

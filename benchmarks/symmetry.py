@@ -9,20 +9,18 @@ numbers hold per core on a busy machine too; the best of some repetitions.
 from __future__ import annotations
 
 import argparse
-import json
 import platform
 import time
-from pathlib import Path
 
 import numpy as np
 
+from benchmarks import keep
 from generator.symmetry import CanonicalMap, SymmetryGroup
 from generator.symmetry.atlas import SCHEMES
 from generator.symmetry.quaternions import normalise, to_matrix
 
 GROUPS = ("C1", "C2", "C4", "C6", "C12", "D2", "D3", "D6", "T", "O", "I", "SO(2)", "O(2)", "SO(3)")
 REPETITIONS = 5
-RESULT = Path(__file__).parent / "results" / "symmetry.json"
 
 
 def poses_per_second(canonical: CanonicalMap, n: int) -> float:
@@ -50,9 +48,8 @@ def main() -> None:
         results[name] = {scheme: poses_per_second(CanonicalMap(group, scheme), n) for scheme in SCHEMES}
         rates = "  ".join(f"{results[name][scheme] / 1e6:>11.2f} M poses/s" for scheme in SCHEMES)
         print(f"{name:>7} {group.order:>6}  {rates}")
-    RESULT.parent.mkdir(parents=True, exist_ok=True)
     record = {"poses": n, "machine": platform.machine(), "numpy": np.__version__, "poses_per_second": results}
-    RESULT.write_text(json.dumps(record, indent=1) + "\n")
+    keep("symmetry", record)
 
 
 if __name__ == "__main__":

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-import os
 import resource
 import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
 
+from benchmarks import ROOT, keep
 from generator.config import Recipe, load_recipe
 from generator.dataset import MODELS_FOLDER, Dataset, FinishedImage
 from generator.formats import bop
@@ -25,11 +24,11 @@ from generator.formats.bop import ScenePaths
 from generator.formats.files import read_json, read_json_lines
 from generator.generate import Execution, generate
 from generator.models import load_models
+from generator.parallel import usable_cores
 from generator.plan import ImagePlan, plan_image
 from generator.replay import read_recipe
 from generator.review.validate import validate
 
-ROOT = Path(__file__).resolve().parents[1]
 PAPERS_IMAGES = 30_000
 MADE = 8
 
@@ -40,7 +39,7 @@ def main() -> None:
     parser.add_argument("dataset", type=Path, nargs="?", help="what generate made, with at most one scene folder")
     parser.add_argument("--images", type=int, default=2000, help="how many to repeat its images to")
     given = parser.parse_args()
-    cores = len(os.sched_getaffinity(0))
+    cores = usable_cores()
     with tempfile.TemporaryDirectory() as folder:
         source = given.dataset or _generate(Path(folder) / "made", cores)
         root = Path(folder) / "repeated"
@@ -62,9 +61,7 @@ def main() -> None:
     }
     for name, value in result.items():
         print(f"{name:46} {value}")
-    file = ROOT / "benchmarks" / "results" / "validate.json"
-    file.parent.mkdir(exist_ok=True)
-    file.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    keep("validate", result)
 
 
 def _generate(root: Path, cores: int) -> Path:
