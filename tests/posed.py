@@ -49,8 +49,3 @@ def commit(dataset: Dataset, obj_ids: Sequence[int], numbers: Iterable[int] = NU
         gt = random_poses(rng, obj_ids, instances)
         spec = {"image_id": plan.im_id}
         dataset.commit(FinishedImage(plan, files, random_camera(rng), gt, [info] * instances, [], spec))
-
-
-def tree(root: Path) -> dict[str, bytes]:
-    """Every file's content by its path."""
-    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}

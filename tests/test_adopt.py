@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from posed import random_camera, random_poses, tree
+from posed import random_camera, random_poses
+from trees import contents
 
 from generator.adopt import adopt
 from generator.formats.bop import ScenePaths, read_scene_json, write_scene_json
@@ -48,9 +49,9 @@ def bop(tless_models: Path, tmp_path: Path) -> Path:
 
 @pytest.mark.tless
 def test_labels_lie_beside_files_that_stay_as_they_are(bop: Path) -> None:
-    before = tree(bop)
+    before = contents(bop)
     adoption = adopt(bop, workers=1)
-    after = tree(bop)
+    after = contents(bop)
     assert after.keys() - before.keys() == {*LABELS, "symmetries.json"}
     assert {name: after[name] for name in before} == before
     assert adoption.models == bop / "models_cad"
@@ -94,10 +95,10 @@ def test_look_alikes_share_a_label(bop: Path) -> None:
 @pytest.mark.tless
 def test_the_same_again_changes_nothing_and_another_table_relabels(bop: Path, tmp_path: Path) -> None:
     adopt(bop, workers=1)
-    first = tree(bop)
+    first = contents(bop)
     times = {path: path.stat().st_mtime_ns for path in bop.rglob("scene_*.json")}
     assert adopt(bop, workers=2).written == 0
-    assert tree(bop) == first
+    assert contents(bop) == first
     assert times == {path: path.stat().st_mtime_ns for path in times}
 
     table = tmp_path / "table.yaml"
@@ -105,20 +106,20 @@ def test_the_same_again_changes_nothing_and_another_table_relabels(bop: Path, tm
     adoption = adopt(bop, symmetries=table, workers=1)
     assert (adoption.table.scheme, adoption.table.entries[26].group.name) == ("atlas", "C1")
     assert adoption.table.entries[27].group.name == "C4", "what the table does not name stays as declared"
-    second = tree(bop)
+    second = contents(bop)
     assert {name for name in first if first[name] != second[name]} == {*LABELS, "symmetries.json"}
     labels = read_scene_json(ScenePaths.of(bop, 26, "train_primesense").scene_gt_canonical)
     assert {label["n_regressors"] for entries in labels.values() for label in entries} == {1}
 
     adopt(bop, workers=1)
-    assert tree(bop) == first
+    assert contents(bop) == first
 
 
 @pytest.mark.tless
 def test_a_link_to_another_disk_is_followed(bop: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Renaming does not reach across disks; whole files must arrive all the same."""
     adopt(bop, workers=1)
-    expected = tree(bop)
+    expected = contents(bop)
     for name in LABELS:
         (bop / name).unlink()
     rename = Path.replace
@@ -130,7 +131,7 @@ def test_a_link_to_another_disk_is_followed(bop: Path, monkeypatch: pytest.Monke
 
     monkeypatch.setattr(Path, "replace", within_one_disk)
     adopt(bop, workers=1)
-    assert tree(bop) == expected
+    assert contents(bop) == expected
 
 
 @pytest.mark.tless
@@ -211,11 +212,11 @@ def test_what_is_no_bop_dataset_is_left_alone(tmp_path: Path) -> None:
 
 
 def _assert_refused(root: Path, call: Callable[[], object], message: str) -> None:
-    before = tree(root)
+    before = contents(root)
     with pytest.raises(ValueError, match=message) as error:
         call()
     assert "\n" not in str(error.value)
-    assert tree(root) == before
+    assert contents(root) == before
 
 
 def _scenes(root: Path) -> list[ScenePaths]:

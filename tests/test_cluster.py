@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 import psutil
 import pytest
+from trees import data_files
 
 from generator import cluster, workers
 from generator.cluster import connection, crew
@@ -91,11 +92,6 @@ def _make(root: Path, recipe: Recipe, execute: Execute, drop_limit_s: float = 30
     return sorted(outcomes, key=lambda outcome: outcome.job.drop)
 
 
-def _tree(root: Path) -> dict[str, bytes]:
-    files = {path.relative_to(root): path for path in sorted(root.rglob("*")) if path.is_file()}
-    return {str(name): path.read_bytes() for name, path in files.items() if name.parts[0] != LOGS_FOLDER}
-
-
 def _images(tree: dict[str, bytes]) -> dict[str, bytes]:
     return {name: content for name, content in tree.items() if "/rgb/" in name}
 
@@ -105,7 +101,7 @@ def reference(recipe: Recipe, tmp_path_factory: pytest.TempPathFactory) -> dict[
     """Every file of the dataset as one local worker makes it."""
     root = tmp_path_factory.mktemp("reference") / "d"
     _make(root, recipe, partial(workers.run, workers=1))
-    return _tree(root)
+    return data_files(root)
 
 
 def _at_work() -> list[psutil.Process]:
@@ -127,7 +123,7 @@ def test_the_cluster_does_not_change_a_byte(two_nodes: Any, reference: dict[str,
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["made"] == len(_images(reference))
     assert len(done.stderr.splitlines()) < 20, "a bar, and nothing of Ray"
-    made = _tree(tmp_path / "d")
+    made = data_files(tmp_path / "d")
     assert {name: made[name] for name in reference} == reference
     assert made.keys() - reference.keys() == {"preview.jpg"}
     logs = list((tmp_path / "d" / LOGS_FOLDER).iterdir())
@@ -159,7 +155,7 @@ def test_images_and_sources_travel_where_no_folder_is_shared(
     _make(tmp_path / "local", travelling, partial(workers.run, workers=1))
     outcomes = _make(own / "d", travelling, partial(cluster.run, address=two_nodes.address))
     assert [(outcome.made, outcome.failure) for outcome in outcomes] == [(1, "")] * 3
-    assert _tree(tmp_path / "d") == _tree(tmp_path / "local")
+    assert data_files(tmp_path / "d") == data_files(tmp_path / "local")
     assert list((tmp_path / "d" / LOGS_FOLDER).iterdir()) == [], "no worker has been here"
 
 
@@ -198,7 +194,7 @@ def test_a_lost_node_and_a_killed_worker_do_not_change_a_byte(
     outcomes = _make(tmp_path / "d", recipe, run)
     two_nodes.remove_node(nodes.pop())
     assert [(outcome.made, outcome.failure) for outcome in outcomes] == [(1, "")] * recipe.images
-    assert _tree(tmp_path / "d") == reference
+    assert data_files(tmp_path / "d") == reference
     of_node = ["node has died" in death for death in deaths]
     assert of_node[0], "and of workers that were sent there before it was known"
     assert not of_node[-1]
@@ -226,7 +222,7 @@ def test_drops_that_kill_hang_or_never_settle_do_not_stop_the_others(
     assert failed[1].killed
     assert failed[2].failure == "took longer than 15 s"
     assert failed[4].failure == "did not come to rest, as a test asked"
-    images = _images(_tree(tmp_path / "d"))
+    images = _images(data_files(tmp_path / "d"))
     assert len(images) == recipe.images - 3
     assert images == {name: reference[name] for name in images}
 
@@ -242,7 +238,7 @@ def test_a_run_that_is_left_stops_its_workers_and_can_be_gone_on_with(
     _make(tmp_path / "d", recipe, first)
     _wait_until(lambda: not _at_work())
     _make(tmp_path / "d", recipe, partial(workers.run, workers=1))
-    assert _tree(tmp_path / "d") == reference
+    assert data_files(tmp_path / "d") == reference
 
 
 def _wait_until(fulfilled: Callable[[], bool]) -> None:

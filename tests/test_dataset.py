@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from trees import contents
 
 from generator.config import Recipe, load_recipe
 from generator.dataset import Dataset, DatasetError, FinishedImage
@@ -58,14 +59,6 @@ def _image(number: int) -> FinishedImage:
     )
 
 
-def _tree(root: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(root)): path.read_bytes()
-        for path in sorted(root.rglob("*"))
-        if path.is_file() and not path.name.endswith(".lock")
-    }
-
-
 def test_an_interrupted_dataset_ends_like_an_uninterrupted_one(
     tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel]
 ) -> None:
@@ -82,16 +75,16 @@ def test_an_interrupted_dataset_ends_like_an_uninterrupted_one(
             pieces.commit(_image(number))
         pieces.assemble()
     assert pieces.missing() == []
-    assert _tree(root) == _tree(tmp_path / "whole")
+    assert contents(root) == contents(tmp_path / "whole")
 
 
 def test_assembling_twice_changes_nothing(tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel]) -> None:
     dataset = Dataset.open(tmp_path / "d", recipe, models, "")
     dataset.commit(_image(0))
     dataset.assemble()
-    before = _tree(tmp_path / "d")
+    before = contents(tmp_path / "d")
     dataset.assemble()
-    assert _tree(tmp_path / "d") == before
+    assert contents(tmp_path / "d") == before
 
 
 @pytest.mark.parametrize("lost", ["scene_camera.json", "scene_gt.json", "scene_gt_canonical.json", "scene_spec.jsonl"])
@@ -102,12 +95,12 @@ def test_an_interrupted_assembly_is_made_good(
     dataset = Dataset.open(tmp_path / "d", recipe, models, "")
     dataset.commit(_image(0))
     dataset.assemble()
-    complete = _tree(tmp_path / "d")
+    complete = contents(tmp_path / "d")
     scene = dataset.scene(1)
     (scene.root / lost).unlink()
     scene.scene_camera.unlink(missing_ok=True)
     dataset.assemble()
-    assert _tree(tmp_path / "d") == complete
+    assert contents(tmp_path / "d") == complete
 
 
 def test_labels_follow_from_poses_and_symmetries(
@@ -147,10 +140,10 @@ def test_another_recipe_is_refused(
     tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel], key: str, value: object
 ) -> None:
     Dataset.open(tmp_path / "d", recipe, models, "")
-    before = _tree(tmp_path / "d")
+    before = contents(tmp_path / "d")
     with pytest.raises(DatasetError, match=key):
         Dataset.open(tmp_path / "d", recipe.model_copy(update={key: value}), models, "")
-    assert _tree(tmp_path / "d") == before
+    assert contents(tmp_path / "d") == before
 
 
 def test_other_models_or_photographs_are_refused(
@@ -170,7 +163,7 @@ def test_a_foreign_folder_is_left_alone(tmp_path: Path, recipe: Recipe, models: 
     (foreign / "thesis.tex").write_text("dear")
     with pytest.raises(DatasetError, match=r"thesis\.tex"):
         Dataset.open(foreign, recipe, models, "")
-    assert _tree(foreign) == {"thesis.tex": b"dear"}
+    assert contents(foreign) == {"thesis.tex": b"dear"}
     with pytest.raises(DatasetError, match="cannot be used"):
         Dataset.open(foreign / "thesis.tex" / "d", recipe, models, "")
 

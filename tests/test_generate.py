@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from trees import data_files
 
 from generator.annotation import PosedModel
 from generator.config import load_recipe
@@ -37,7 +38,6 @@ objects: {count: [2, 4]}
 render: {samples: 2}
 outputs: [rgb, depth, masks, normals, object_coordinates, exr]
 """
-NOT_DATA = {".synthetless.lock", ".logs"}
 
 
 @pytest.fixture(scope="session")
@@ -63,14 +63,6 @@ def _generate(recipe: Path, out: Path, *options: str, code: int = 0, **environme
     )
     assert done.returncode == code, done.stderr
     return done.stdout
-
-
-def _tree(root: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(root)): path.read_bytes()
-        for path in sorted(root.rglob("*"))
-        if path.is_file() and not NOT_DATA & set(path.relative_to(root).parts)
-    }
 
 
 @pytest.fixture(scope="session")
@@ -105,7 +97,7 @@ def test_every_file_is_there(dataset: Path) -> None:
 
 def test_workers_do_not_change_a_byte(dataset: Path, recipe: Path, tmp_path: Path) -> None:
     _generate(recipe, tmp_path / "d", "--workers", "2")
-    assert _tree(tmp_path / "d") == _tree(dataset)
+    assert data_files(tmp_path / "d") == data_files(dataset)
 
 
 def test_parts_do_not_change_a_byte(dataset: Path, recipe: Path, tmp_path: Path) -> None:
@@ -117,7 +109,7 @@ def test_parts_do_not_change_a_byte(dataset: Path, recipe: Path, tmp_path: Path)
         for k in (1, 2)
     ]
     assert [part.wait(timeout=400) for part in parts] == [0, 0]
-    assert _tree(out) == _tree(dataset)
+    assert data_files(out) == data_files(dataset)
 
 
 def test_another_seed_changes_every_image(dataset: Path, recipe: Path, tmp_path: Path) -> None:
@@ -145,14 +137,14 @@ def test_ctrl_c_and_again_gives_the_same_bytes(dataset: Path, recipe: Path, tmp_
     made = len(bop.read_scene_json(ScenePaths.of(out, 1).scene_camera))
     assert 1 <= made < 6, "what is made can be looked at"
     _generate(recipe, out)
-    assert _tree(out) == _tree(dataset)
+    assert data_files(out) == data_files(dataset)
 
 
 def test_a_finished_dataset_is_left_as_it_is(dataset: Path, recipe: Path) -> None:
-    before = _tree(dataset)
+    before = data_files(dataset)
     summary = json.loads(_generate(recipe, dataset))
     assert (summary["images"], summary["made"]) == (6, 0)
-    assert _tree(dataset) == before
+    assert data_files(dataset) == before
 
 
 def test_drops_that_kill_hang_or_never_settle_do_not_stop_the_others(
@@ -181,8 +173,8 @@ def test_drops_that_kill_hang_or_never_settle_do_not_stop_the_others(
     assert b"drop 3: 2 images" in redone.stdout
     assert len(list((out / ".failures").iterdir())) == 2
     _generate(recipe, out, "--images", "6")
-    ours = {name: content for name, content in _tree(dataset).items() if "/rgb/" in name}
-    again = _tree(out)
+    ours = {name: content for name, content in data_files(dataset).items() if "/rgb/" in name}
+    again = data_files(out)
     assert {name: again[name] for name in ours} == ours, "a second run makes what the first could not"
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from trees import data_files
 
 pytestmark = [pytest.mark.blender, pytest.mark.timeout(3000)]
 
@@ -29,7 +30,6 @@ objects: {{count: [1, 4]}}
 render: {{samples: 1}}
 """
 DEATHS = 5
-NO_DATA = {".logs", ".synthetless.lock", ".synthetless.assembly.lock"}
 
 
 @pytest.fixture(scope="module")
@@ -52,24 +52,19 @@ def _run(recipe: Path, out: Path, *options: str) -> int:
     return process.returncode
 
 
-def _tree(root: Path) -> dict[str, bytes]:
-    files = {path.relative_to(root): path for path in sorted(root.rglob("*")) if path.is_file()}
-    return {str(name): path.read_bytes() for name, path in files.items() if not NO_DATA & set(name.parts)}
-
-
 @pytest.fixture(scope="module")
 def undisturbed(recipe: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     """Every file of the dataset as one worker makes it in one go."""
     out = tmp_path_factory.mktemp("undisturbed") / "d"
     assert _run(recipe, out, "--workers", "1") == 0
-    tree = _tree(out)
+    tree = data_files(out)
     assert len([name for name in tree if "/rgb/" in name]) == IMAGES
     return tree
 
 
 def test_two_workers(recipe: Path, undisturbed: dict[str, bytes], tmp_path: Path) -> None:
     assert _run(recipe, tmp_path / "d", "--workers", "2") == 0
-    assert _tree(tmp_path / "d") == undisturbed
+    assert data_files(tmp_path / "d") == undisturbed
 
 
 def test_three_parts(recipe: Path, undisturbed: dict[str, bytes], tmp_path: Path) -> None:
@@ -77,7 +72,7 @@ def test_three_parts(recipe: Path, undisturbed: dict[str, bytes], tmp_path: Path
     out = tmp_path / "d"
     processes = [_start(recipe, out, "--workers", "1", "--part", f"{k}/3") for k in (1, 2, 3)]
     assert [process.communicate(timeout=2500) and process.returncode for process in processes] == [0, 0, 0]
-    assert _tree(out) == undisturbed
+    assert data_files(out) == undisturbed
 
 
 def test_killed_again_and_again(recipe: Path, undisturbed: dict[str, bytes], tmp_path: Path) -> None:
@@ -98,7 +93,7 @@ def test_killed_again_and_again(recipe: Path, undisturbed: dict[str, bytes], tmp
         assert not alive, "workers end when nobody is left to work for"
     codes = [_run(recipe, out, "--workers", "2")]
     assert codes == [0]
-    assert _tree(out) == undisturbed
+    assert data_files(out) == undisturbed
 
 
 def _children(pid: int) -> list[psutil.Process]:
@@ -131,7 +126,7 @@ def test_a_full_disk_that_is_freed(recipe: Path, undisturbed: dict[str, bytes]) 
         assert code == 2, "the disk was to be full before the end"
         ballast.unlink()
         assert _run(recipe, disk / "d", "--workers", "2") == 0
-        assert _tree(disk / "d") == undisturbed
+        assert data_files(disk / "d") == undisturbed
 
 
 def test_a_cluster(recipe: Path, undisturbed: dict[str, bytes], tmp_path: Path) -> None:
@@ -146,4 +141,4 @@ def test_a_cluster(recipe: Path, undisturbed: dict[str, bytes], tmp_path: Path) 
         assert _run(recipe, tmp_path / "d", "--executor", "ray", "--address", cluster.address) == 0
     finally:
         cluster.shutdown()
-    assert _tree(tmp_path / "d") == undisturbed
+    assert data_files(tmp_path / "d") == undisturbed

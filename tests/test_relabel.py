@@ -18,7 +18,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from posed import commit, open_dataset, tree
+from posed import commit, open_dataset
+from trees import contents
 
 from generator.changes import is_half_changed
 from generator.dataset import Dataset
@@ -84,14 +85,14 @@ def test_the_files_are_those_that_assembling_would_have_written(
     shutil.copy(root / "symmetries.json", tmp_path / "fresh" / "symmetries.json")
     commit(fresh, OBJECTS)
     fresh.assemble()
-    assert tree(root) == tree(tmp_path / "fresh")
+    assert contents(root) == contents(tmp_path / "fresh")
 
 
 def test_nothing_else_is_touched(root: Path, tmp_path: Path) -> None:
-    before = tree(root)
+    before = contents(root)
     times = {path: path.stat().st_mtime_ns for path in root.rglob("*") if path.is_file()}
     relabel(root, _table(tmp_path, "25: C1"), workers=1)
-    after = tree(root)
+    after = contents(root)
     assert {name for name in before if before[name] != after[name]} == MAY_CHANGE
     assert after.keys() == before.keys()
     touched = {str(path.relative_to(root)) for path, written in times.items() if path.stat().st_mtime_ns != written}
@@ -99,17 +100,17 @@ def test_nothing_else_is_touched(root: Path, tmp_path: Path) -> None:
 
 
 def test_back_and_forth_gives_the_same_files(root: Path, tmp_path: Path) -> None:
-    before, symmetries = tree(root), tmp_path / "before.json"
+    before, symmetries = contents(root), tmp_path / "before.json"
     shutil.copy(root / "symmetries.json", symmetries)
     assert json.loads(symmetries.read_text())["objects"]["25"]["group"] == "C2"
     relabel(root, _table(tmp_path, "25: C1"), workers=1)
-    assert tree(root) != before
+    assert contents(root) != before
     relabel(root, symmetries, workers=1)
-    assert tree(root) == before
+    assert contents(root) == before
     relabel(root, scheme="atlas", workers=1)
     assert SymmetryTable.read(root / "symmetries.json").scheme == "atlas"
     relabel(root, scheme="pitteri2019", workers=1)
-    assert tree(root) == before
+    assert contents(root) == before
 
 
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -125,7 +126,7 @@ def test_any_axis_and_offset_come_back_to_the_bit(
     entry = {"group": group, "axis": axis, "offset": offset}
     table = _table(tmp_path, json.dumps({"scheme": scheme, "objects": {"25": entry}}))
     relabel(root, table, workers=1)
-    there = tree(root)
+    there = contents(root)
     assert (
         read_json(root / "dataset.json")["symmetries"]["sha256"]
         == SymmetryTable.read(root / "symmetries.json").digest()
@@ -133,9 +134,9 @@ def test_any_axis_and_offset_come_back_to_the_bit(
     shutil.copy(root / "symmetries.json", tmp_path / "own.json")
     relabel(root, _table(tmp_path, "25: C1"), workers=1)
     relabel(root, tmp_path / "own.json", workers=1)
-    assert tree(root) == there
+    assert contents(root) == there
     relabel(root, workers=1)
-    assert tree(root) == there
+    assert contents(root) == there
 
 
 def test_only_the_affected_objects_are_made_anew(root: Path, tmp_path: Path) -> None:
@@ -169,10 +170,10 @@ def test_the_scheme_is_the_tables_or_stays(root: Path, tmp_path: Path) -> None:
 
 
 def test_a_dry_run_tells_what_then_happens(root: Path, tmp_path: Path) -> None:
-    before, labels = tree(root), _labels(root)
+    before, labels = contents(root), _labels(root)
     table = _table(tmp_path, "25: C1\n27: C2")
     told = relabel(root, table, dry_run=True, workers=1)
-    assert tree(root) == before
+    assert contents(root) == before
     assert relabel(root, table, workers=1) == told
     assert (told.scenes, told.images, told.scheme_before, told.scheme_after) == (3, 6, "pitteri2019", "pitteri2019")
     none, half = told.objects
@@ -206,19 +207,19 @@ def test_an_edited_symmetries_json_takes_effect(root: Path, models: dict[int, Ob
 
 
 def test_labels_that_are_lost_or_damaged_are_made_anew(root: Path, tmp_path: Path) -> None:
-    before = tree(root)
+    before = contents(root)
     (root / LABELS[0]).unlink()
     (root / LABELS[1]).write_bytes(before[LABELS[1]][:-200])
     (root / LABELS[2]).write_text('{"0": [{"obj_id": 1}]}')
     relabel(root, scheme="pitteri2019", workers=1)
-    assert tree(root) == before
+    assert contents(root) == before
 
 
 def test_several_processes_write_the_same(root: Path, tmp_path: Path) -> None:
     other = Path(shutil.copytree(root, tmp_path / "other"))
     table = _table(tmp_path, "scheme: atlas\n25: C1")
     assert relabel(root, table, workers=2) == relabel(other, table, workers=1)
-    assert tree(root) == tree(other)
+    assert contents(root) == contents(other)
 
 
 def test_a_dataset_grows_with_its_new_symmetries(root: Path, models: dict[int, ObjectModel], tmp_path: Path) -> None:
@@ -230,7 +231,7 @@ def test_a_dataset_grows_with_its_new_symmetries(root: Path, models: dict[int, O
     shutil.copy(root / "symmetries.json", tmp_path / "fresh" / "symmetries.json")
     commit(fresh, OBJECTS, [0, 1, 2, 3, 1000, 1001, 2000, 2002])
     fresh.assemble()
-    assert tree(root) == tree(tmp_path / "fresh")
+    assert contents(root) == contents(tmp_path / "fresh")
 
 
 def test_a_dataset_without_images_takes_symmetries(models: dict[int, ObjectModel], tmp_path: Path) -> None:
@@ -325,11 +326,11 @@ def test_a_full_disk_leaves_the_dataset_alone(root: Path, monkeypatch: pytest.Mo
 
 
 def _assert_refused(root: Path, call: Callable[[], object], message: str) -> None:
-    before = tree(root)
+    before = contents(root)
     with pytest.raises(ValueError, match=message) as error:
         call()
     assert "\n" not in str(error.value)
-    assert tree(root) == before
+    assert contents(root) == before
     assert not [path for path in root.rglob("*") if "relabel" in path.name]
 
 
@@ -352,7 +353,9 @@ def _in_child(work: Callable[[], object]) -> multiprocessing.process.BaseProcess
 
 def _judge(root: Path, before: dict[str, bytes], after: dict[str, bytes]) -> str:
     """Every file is whole and either old or new; together they are old or new, unless they are known to be mixed."""
-    found = {name: data for name, data in tree(root).items() if not name.startswith(".relabel") and ".lock" not in name}
+    found = {
+        name: data for name, data in contents(root).items() if not name.startswith(".relabel") and ".lock" not in name
+    }
     assert found.keys() == before.keys()
     for name, data in found.items():
         assert data in (before[name], after[name])
@@ -363,7 +366,7 @@ def _judge(root: Path, before: dict[str, bytes], after: dict[str, bytes]) -> str
 
 
 def test_kills_at_random_moments_lose_nothing(original: Path, relabelled: Path, tmp_path: Path) -> None:
-    before, after = tree(original), tree(relabelled)
+    before, after = contents(original), contents(relabelled)
     timed = Path(shutil.copytree(original, tmp_path / "timed"))
     start = time.perf_counter()
     child = _in_child(partial(relabel, timed, scheme="atlas", workers=1))
@@ -378,14 +381,14 @@ def test_kills_at_random_moments_lose_nothing(original: Path, relabelled: Path, 
         child.join()
         _judge(root, before, after)
         relabel(root, scheme="atlas", workers=1)
-        assert tree(root) == after
+        assert contents(root) == after
 
 
 def test_a_kill_before_any_change_on_disk_loses_nothing(
     original: Path, relabelled: Path, models: dict[int, ObjectModel], tmp_path: Path
 ) -> None:
     """Killed before its 1st, 2nd, ... step that writes; then relabelled again, or gone on with by generate."""
-    before, after = tree(original), tree(relabelled)
+    before, after = contents(original), contents(relabelled)
     seen = []
     for step in range(1, 200):
         root = Path(shutil.copytree(original, tmp_path / f"{step}"))
@@ -394,15 +397,15 @@ def test_a_kill_before_any_change_on_disk_loses_nothing(
         seen.append(_judge(root, before, after))
         other = Path(shutil.copytree(root, tmp_path / f"{step}o"))
         Dataset.assemble(open_dataset(other, models))
-        continued = {name: data for name, data in tree(other).items() if ".lock" not in name}
+        continued = {name: data for name, data in contents(other).items() if ".lock" not in name}
         assert continued == (before if seen[-1] == "old" else after)
         if seen[-1] == "half":
             with pytest.raises(ValueError, match="half relabelled"):
                 relabel(root, dry_run=True)
             relabel(root, scheme="pitteri2019", workers=1)
-            assert tree(root) == before, "what was begun is completed, then undone"
+            assert contents(root) == before, "what was begun is completed, then undone"
         relabel(root, scheme="atlas", workers=1)
-        assert tree(root) == after
+        assert contents(root) == after
         if child.exitcode == 0:
             break
     assert child.exitcode == 0
@@ -445,7 +448,7 @@ if __name__ == "__main__":
     assert process.stdout.readline() == b"a scene is labelled\n"
     process.kill()
     process.wait()
-    assert _judge(root, tree(original), tree(relabelled)) == "old"
+    assert _judge(root, contents(original), contents(relabelled)) == "old"
     relabel(root, scheme="atlas", workers=1)
-    assert tree(root) == tree(relabelled)
+    assert contents(root) == contents(relabelled)
     assert process.stdout.read() == b"", "its end is seen when no worker holds it any more"

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from trees import contents
 
 from generator.formats.files import read_bytes
 from generator.formats.images import decode_mask, decode_rgb
@@ -120,7 +121,7 @@ def test_nothing_is_taken_from_elsewhere(small_preview: Path) -> None:
 
 def test_the_same_dataset_gives_the_same_bytes(small_preview: Path, small_dataset: Path, tmp_path: Path) -> None:
     again = write_preview(small_dataset, tmp_path / "again")
-    assert _tree(again.parent) == _tree(small_preview.parent)
+    assert contents(again.parent) == contents(small_preview.parent)
 
 
 def test_a_preview_is_replaced_and_nothing_else(small_dataset: Path, tmp_path: Path) -> None:
@@ -141,7 +142,7 @@ def test_a_preview_is_replaced_and_nothing_else(small_dataset: Path, tmp_path: P
 
 def test_a_damaged_dataset_leaves_the_former_preview(small_dataset: Path, tmp_path: Path) -> None:
     to = tmp_path / "pages"
-    before = _tree(write_preview(small_dataset, to, limit=2).parent)
+    before = contents(write_preview(small_dataset, to, limit=2).parent)
     last = images_of(small_dataset)[-1]
     damaged = last.scene.depth(last.labels.im_id)
     content = damaged.read_bytes()
@@ -151,7 +152,7 @@ def test_a_damaged_dataset_leaves_the_former_preview(small_dataset: Path, tmp_pa
             write_preview(small_dataset, to)
     finally:
         damaged.write_bytes(content)
-    assert _tree(to) == before
+    assert contents(to) == before
 
 
 def test_no_dataset_is_refused(tmp_path: Path) -> None:
@@ -176,7 +177,3 @@ def _filled(path: str, shape: tuple[int, ...]) -> np.ndarray:
     if rings:
         cv2.fillPoly(filled, rings, 1)
     return filled.astype(bool)
-
-
-def _tree(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
