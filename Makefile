@@ -24,7 +24,7 @@ demo: setup  ## a small dataset of the built-in parts, in out/demo
 	$(BIN)/synthetless generate configs/demo.yaml --out out/demo
 
 test: setup  ## every test, real renders included
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses logical --dist loadfile --no-loadscope-reorder
 
 interop: setup  ## the exports in trainers' own loaders: Hugging Face datasets, torch, torchvision (installs 1.3 GB)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[interop]'
