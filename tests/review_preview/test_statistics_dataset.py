@@ -158,6 +158,17 @@ def test_plots_are_the_same_each_time_and_hold_no_live_text(by_default: Observat
     assert b"<script" not in first and b"&lt;script&gt;$a$" in first
 
 
+@pytest.mark.filterwarnings("error")
+def test_long_names_of_photographs_leave_room_for_the_bars() -> None:
+    pytest.importorskip("matplotlib", reason=MATPLOTLIB)
+    from generator.review.statistics.plots import distribution_plot
+
+    names = tuple(f"polyhaven_exterior_concrete_tile_facade_{number:02}_diff_1k.jpg" for number in range(30))
+    svg = distribution_plot(Distribution("k", "g", "t", "", 30, (), names, (1,) * 30, None, None, None)).decode()
+    shown = ["polyhaven_ext…29_diff_1k.jpg", "polyhaven_ext…08_diff_1k.jpg"]
+    assert all(name in svg for name in shown)
+
+
 def test_without_records_there_is_nothing_to_compare_with(small_dataset: Path, tmp_path: Path) -> None:
     adopted = _copy_without_recipe(small_dataset, tmp_path / "adopted")
     found = statistics(adopted)
