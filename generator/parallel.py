@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
-from multiprocessing.connection import wait
+from multiprocessing import get_context
 from typing import Protocol, TypeVar
 
+from pebble import ProcessExpired, ProcessPool
 from tqdm import tqdm
 
 Task = TypeVar("Task")
@@ -49,19 +46,20 @@ def processes(wanted: int | None, most: int) -> Iterator[Map]:
     if count <= 1:
         yield lambda function, tasks, chunksize=1: map(function, tasks)
         return
-    with ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_begin) as pool:
+    with ProcessPool(count, initializer=_ignore_interrupt, context=get_context("spawn")) as pool:
 
         def map_in_pool(
             function: Callable[[Task], Result], tasks: Sequence[Task], chunksize: int = 1
         ) -> Iterator[Result]:
-            return pool.map(function, tasks, chunksize=chunksize)
+            return iter(pool.map(function, tasks, chunksize=chunksize).result())
 
         try:
             yield map_in_pool
-        except BrokenProcessPool:
-            raise ChildProcessError("a worker process was killed, perhaps for lack of memory; run it again") from None
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+        except BaseException as error:
+            pool.stop()  # or whoever pressed Ctrl-C would wait for the tasks that are under way
+            if isinstance(error, ProcessExpired):
+                told = "a worker process was killed, perhaps for lack of memory; run it again"
+                raise ChildProcessError(told) from None
             raise
 
 
@@ -80,13 +78,5 @@ def watched(
     return iter(tqdm(run(function, tasks), total=len(tasks), desc=what, unit=unit, disable=None))
 
 
-def _begin() -> None:
+def _ignore_interrupt() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to answer
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """An orphan would wait for its next task for ever."""
-    if (parent := parent_process()) is not None:
-        wait([parent.sentinel])
-    os._exit(1)

@@ -111,7 +111,7 @@ def run(jobs: Iterable[Job], place: Workplace, workers: int) -> Iterator[Outcome
                         submit(islice(waiting, 1))
                         yield outcome
         except BaseException:
-            pool.stop()  # type: ignore[no-untyped-call]  # an image is committed whole or not at all, so workers may die at any moment
+            pool.stop()  # an image is committed whole or not at all, so workers may die at any moment
             raise
 
 

@@ -67,7 +67,10 @@ def test_a_killed_process_is_told_in_one_line() -> None:
         list(each(_die, range(6), 2, "numbers", "number"))
 
 
-def test_no_process_outlives_the_one_that_started_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
+def test_no_process_outlives_the_one_that_started_it(end: signal.Signals, tmp_path: Path) -> None:
+    """Killed, it leaves orphans, who stop after their task; at Ctrl-C it does not wait for tasks to end."""
+    seconds = 600 if end == signal.SIGINT else 0.5
     script = tmp_path / "script.py"
     script.write_text(
         "import time\n"
@@ -76,15 +79,21 @@ def test_no_process_outlives_the_one_that_started_it(tmp_path: Path) -> None:
         "    with processes(2, 2) as run:\n"
         "        for _ in run(time.sleep, [0, 0]): pass\n"
         "        print('begun', flush=True)\n"
-        "        for _ in run(time.sleep, [0.5] * 2000): pass\n"
+        f"        for _ in run(time.sleep, [{seconds}] * 2000): pass\n"
     )
     parent = subprocess.Popen(
-        [sys.executable, script], env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE
+        [sys.executable, script],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert parent.stdout is not None
-    assert parent.stdout.readline() == b"begun\n"
+    assert parent.stdout.readline() == "begun\n"
     children = psutil.Process(parent.pid).children(recursive=True)
     assert len(children) >= 2
-    parent.kill()
-    parent.communicate()
-    assert psutil.wait_procs(children, timeout=20)[1] == []
+    time.sleep(0.5)  # into the tasks
+    parent.send_signal(end)
+    _, errors = parent.communicate(timeout=60)
+    assert errors.count("KeyboardInterrupt") == (end == signal.SIGINT), "of the parent alone"
+    assert psutil.wait_procs(children, timeout=60)[1] == []
