@@ -1,4 +1,4 @@
-"""Time the exact geometry of an image: ``python benchmarks/annotate.py [MODELS_DIR]``.
+"""Time the exact geometry of an image: ``python -m benchmarks.annotate [MODELS_DIR]``.
 
 Without a folder it takes the one that SYNTHETLESS_TLESS_MODELS names, or else the parts that come with the project.
 CPU time of this process; of each scene the fastest of a few rounds, since other programs only ever slow one down.

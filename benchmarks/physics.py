@@ -1,4 +1,4 @@
-"""How often a throw comes to rest, and the processor time of a drop: ``python benchmarks/physics.py [MODELS_DIR]``.
+"""How often a throw comes to rest, and the processor time of a drop: ``python -m benchmarks.physics [MODELS_DIR]``.
 
 Without a folder it takes the one that SYNTHETLESS_TLESS_MODELS names, or else the parts that come with the project.
 Prints a table and writes benchmarks/results/physics.json. Needs Blender.

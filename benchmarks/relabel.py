@@ -1,4 +1,4 @@
-"""Time a change of symmetries: ``python benchmarks/relabel.py``.
+"""Time a change of symmetries: ``python -m benchmarks.relabel``.
 
 The dataset is JSON only, of random poses of the parts that come with the project, in a temporary folder: 30,000 images
 with 150,000 instances. Wall time and the CPU time of all processes, their start included; what other programs do in the

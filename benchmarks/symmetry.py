@@ -1,6 +1,6 @@
 """How many poses per second and core the canonical labels of each group and scheme take.
 
-    python benchmarks/symmetry.py [--poses 300000]
+    python -m benchmarks.symmetry [--poses 300000]
 
 Prints a table and writes benchmarks/results/symmetry.json. Counted is processor time, all threads together, so that the
 numbers hold per core on a busy machine too; the best of some repetitions.

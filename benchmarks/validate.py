@@ -1,4 +1,4 @@
-"""Time the validation of a dataset: ``python benchmarks/validate.py [DATASET] [--images 2000]``.
+"""Time the validation of a dataset: ``python -m benchmarks.validate [DATASET] [--images 2000]``.
 
 The images of a generated dataset (a few of the paper's recipe are made if none is given) are repeated until there are
 enough, each with labels and a record of its own, and the whole is validated on every core. The starting of the workers
