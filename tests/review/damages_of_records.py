@@ -1,10 +1,43 @@
-"""Damages to scene_spec.jsonl and scene_gt_coco.json."""
+"""Damages to the records, to scene_spec.jsonl and to scene_gt_coco.json."""
 
 from __future__ import annotations
 
 from damage_kit import IMAGE, OTHER, WHOLE, Victim, damage
 
+from generator.dataset import RECORDS_FOLDER
+
+RECORD = f"{RECORDS_FOLDER}/000001/{IMAGE:06d}.json"
 GT, COCO, SPEC = "scene_gt.json", "scene_gt_coco.json", "scene_spec.jsonl"
+
+
+# --- .records ---
+
+
+@damage("missing", f"/{RECORD}", IMAGE)
+def lost_record(victim: Victim) -> None:
+    (victim.root / RECORD).unlink()
+
+
+@damage("unreadable", f"/{RECORD}", IMAGE)
+def record_of_zero_bytes(victim: Victim) -> None:
+    (victim.root / RECORD).write_bytes(b"")
+
+
+@damage("record", f"/{RECORD}", IMAGE)
+def record_of_another_pose(victim: Victim) -> None:
+    with victim.json(victim.root / RECORD) as record:
+        record["gt"][WHOLE]["cam_t_m2c"][2] += 1.0
+
+
+@damage("record", f"/{RECORD}", IMAGE)
+def record_that_lacks_its_counts(victim: Victim) -> None:
+    with victim.json(victim.root / RECORD) as record:
+        del record["gt_info"]
+
+
+@damage("unreadable", f"/{RECORD}", IMAGE)
+def record_that_is_a_list(victim: Victim) -> None:
+    (victim.root / RECORD).write_text("[1, 2]")
 
 
 # --- scene_spec.jsonl ---

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from damage_kit import DAMAGES, Damage, Victim
 
+from generator.dataset import RECORDS_FOLDER
 from generator.review.validate import validate
 
 MODULES = (damages_of_images, damages_of_labels, damages_of_poses, damages_of_records)
@@ -38,14 +39,22 @@ def test_damage_is_found_in_its_place(valid: Path, tmp_path: Path, damage: Damag
     shutil.copytree(valid, root)
     damage.act(Victim(root))
     if damage.deep:
+        shutil.rmtree(root / RECORDS_FOLDER)  # they would betray it
         assert validate(root, workers=1).valid, "only the rays tell"
     report = validate(root, deep=damage.deep, workers=1)
     places = [(f.kind, str(f.file.relative_to(root)), f.image, f.instance) for f in report.findings]
     assert (damage.kind, damage.file, damage.image, damage.instance) in places, report.lines()
 
 
+def test_a_copy_without_records_is_valid(valid: Path, tmp_path: Path) -> None:
+    root = tmp_path / "dataset"
+    shutil.copytree(valid, root, ignore=shutil.ignore_patterns(RECORDS_FOLDER))
+    assert validate(root, workers=1).valid
+
+
 FILES = (
     "dataset.json",
+    f"{RECORDS_FOLDER}/000001/000001.json",
     "camera.json",
     "symmetries.json",
     "models/models_info.json",

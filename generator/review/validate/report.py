@@ -21,6 +21,7 @@ Kind = Literal[
     "camera",  # cameras against the recipe and against scene_spec.jsonl
     "pose",  # poses that are none, or that scene_spec.jsonl contradicts
     "spec",  # scene_spec.jsonl against the plan and scene_gt.json
+    "record",  # .records/ against the JSON files that were assembled from them
     "gt_info",  # counts, fractions and boxes
     "mask",  # masks against each other
     "depth",  # depth against poses, masks and the table

@@ -11,6 +11,7 @@ from generator.review.validate.files import check_files
 from generator.review.validate.images import ImageCheck
 from generator.review.validate.labels import SceneLabels, check_agreement
 from generator.review.validate.poses import check_cameras, check_poses, check_specs
+from generator.review.validate.records import check_records
 from generator.review.validate.report import Tally
 from generator.review.validate.source import Source
 
@@ -58,6 +59,7 @@ def check_scene(task: SceneTask) -> SceneResult:
     sound, findings = check_poses(source.infos, labels)
     tally.add(findings)
     tally.add(check_specs(source, labels, task.plans, sound))
+    tally.add(check_records(source, task.scene_id, labels))
     labelling = check_canonical(source.symmetries, source.infos, labels, sound)
     tally.add(labelling.findings)
     annotations = match_annotations(source, labels)

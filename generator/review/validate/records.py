@@ -1,0 +1,38 @@
+"""The record of every image, which the JSON files of its scene folder are assembled from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from generator.dataset import RECORDS_FOLDER
+from generator.formats.files import read_json
+from generator.review.validate.labels import SceneLabels
+from generator.review.validate.report import Finding, unusable
+from generator.review.validate.source import Source
+
+
+def check_records(source: Source, scene_id: int, labels: SceneLabels) -> Iterator[Finding]:
+    """Every image has a record that says what the JSON files say, or else the dataset cannot be extended.
+
+    A copy without any records is a whole dataset, too: it is only never gone on with.
+    """
+    folder = source.root / RECORDS_FOLDER / f"{scene_id:06d}"
+    if not folder.parent.is_dir():
+        return
+    files = (
+        ("camera", labels.paths.scene_camera, labels.camera),
+        ("gt", labels.paths.scene_gt, labels.gt),
+        ("gt_info", labels.paths.scene_gt_info, labels.gt_info),
+    )
+    for im_id in labels.image_ids:
+        path = folder / f"{im_id:06d}.json"
+        try:
+            record = read_json(path)
+        except ValueError as error:
+            yield replace(unusable(path, error), image=im_id)
+            continue
+        for key, file, entries in files:
+            if record.get(key) != entries[im_id]:
+                message = f"{key} is not what {file.name} has, which was assembled from it: one of them was changed"
+                yield Finding("record", path, message, im_id)
