@@ -16,6 +16,7 @@ from generator.formats.bop import ScenePaths, read_scene_json, write_scene_json
 from generator.formats.images import encode_normals, encode_object_coordinates
 from generator.labels import label_scene
 from generator.review.validate import Report, validate
+from generator.review.validate.scene import SceneTask, check_scene
 from generator.symmetry import SymmetryTable
 
 EVERYTHING = "outputs=[rgb, depth, masks, normals, object_coordinates, exr]"
@@ -83,6 +84,25 @@ def test_workers_find_the_same(valid: Path, tmp_path: Path) -> None:
     alone = validate(root, deep=True, workers=1)
     assert not alone.valid
     assert validate(root, deep=True, workers=2) == alone
+
+
+def test_folders_in_parts_are_found_the_same(valid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = tmp_path / "d"
+    shutil.copytree(valid, root)
+    for im_id in range(3):
+        (root / f"train_synthetless/000001/rgb/{im_id:06d}.png").write_bytes(b"")
+    with Victim(root).entry("gt", WHOLE, 1) as pose:
+        pose["cam_t_m2c"][0] += 1
+    whole = validate(root, deep=True, workers=1)
+    monkeypatch.setattr("generator.review.validate.run._IMAGES_WORTH_A_TASK", 1)
+    tasks: list[SceneTask] = []
+    monkeypatch.setattr(
+        "generator.review.validate.run.check_scene", lambda task: tasks.append(task) or check_scene(task)
+    )
+    parts = validate(root, deep=True, workers=1)
+    assert [(task.scene_id, task.part, task.parts) for task in tasks] == [(1, 0, 2), (1, 1, 2), (2, 0, 2), (2, 1, 2)]
+    assert set(parts.findings) == set(whole.findings) and len(parts.findings) == len(whole.findings) > 3
+    assert (parts.images, parts.instances, parts.deep_images) == (whole.images, whole.instances, whole.deep_images)
 
 
 def test_a_report_keeps_a_few_faults_of_each_kind_and_counts_all(valid: Path, tmp_path: Path) -> None:

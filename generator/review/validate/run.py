@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
 from generator.dataset import DATASET_FILE
 from generator.parallel import Map, processes, watched
+from generator.plan import ImagePlan
 from generator.review.validate.adopted import AdoptedTask, check_adopted_scene, is_adopted, left_out, read_adopted
 from generator.review.validate.coco_export import check_coco_export
 from generator.review.validate.deep import DeepTask, check_deep, sample
@@ -25,6 +26,8 @@ from generator.review.validate.source import (
 from generator.review.validate.webdataset import Shards, ShardsTask, by_scene, check_companions, check_shards
 
 _DEEP_IMAGES_PER_TASK = 25
+_TASKS_ENOUGH, _IMAGES_WORTH_A_TASK = 4, 100
+"""Whatever the number of processes, so that the same faults are told: each task reads all labels of its folder."""
 
 
 def validate(
@@ -63,11 +66,13 @@ def validate(
     plans = plans_by_scene(source.recipe)
     tally.add(check_folders(root, source.recipe, list(plans)))
     n_deep_tasks = math.ceil(min(deep_images, source.recipe.images) / _DEEP_IMAGES_PER_TASK) if deep else 0
-    with processes(workers, max(len(plans), n_deep_tasks)) as run:
-        tasks = [SceneTask(source, scene_id, tuple(of_scene), limit) for scene_id, of_scene in plans.items()]
-        scenes = list(watched(run, check_scene, tasks, "validating", "part"))
-        for scene in scenes:
+    tasks = list(_tasks(source, plans, limit))
+    with processes(workers, max(len(tasks), n_deep_tasks)) as run:
+        scenes = []
+        for task, scene in zip(tasks, watched(run, check_scene, tasks, "validating", "part"), strict=True):
             tally.merge(scene.tally)
+            if task.part == 0:
+                scenes.append(scene)
         tally.add(_check_staleness(source, scenes))
         images, instances = sum(len(s.image_ids) for s in scenes), sum(s.instances for s in scenes)
         tally.add(check_counts(root, header, images, instances))
@@ -94,6 +99,14 @@ def _validate_adopted(root: Path, deep: bool, exports: tuple[Path, ...], limit: 
         tally.merge(scene.tally)
     images, instances = sum(len(s.image_ids) for s in scenes), sum(s.instances for s in scenes)
     return _report(root, tally, images, instances, notes=tuple(left_out(adopted)))
+
+
+def _tasks(source: Source, plans: Mapping[int, Sequence[ImagePlan]], limit: int) -> Iterator[SceneTask]:
+    """One for a scene folder, or several where there are too few folders to keep a few cores busy."""
+    for scene_id, of_scene in plans.items():
+        parts = max(1, min(_TASKS_ENOUGH // len(plans), len(of_scene) // _IMAGES_WORTH_A_TASK))
+        for part in range(parts):
+            yield SceneTask(source, scene_id, tuple(of_scene), limit, part, parts)
 
 
 def _require(root: Path, exports: Sequence[Path], limit: int) -> None:
