@@ -28,7 +28,7 @@ test: setup  ## every test, real renders included
 
 interop: setup  ## the exports in trainers' own loaders: Hugging Face datasets, torch, torchvision (installs 1.3 GB)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[interop]'
-	$(BIN)/pytest tests/formats
+	$(BIN)/pytest tests/formats tests/review/test_dataset_card.py
 
 lint: setup  ## ruff and mypy --strict
 	$(BIN)/ruff check .
