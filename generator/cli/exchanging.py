@@ -9,11 +9,10 @@ from typing import Annotated, Literal
 
 import typer
 
+from generator.cli.options import Split
 from generator.fetch import fetch
 from generator.formats.coco import export_coco
 from generator.formats.webdataset import export_webdataset, relabel_webdataset
-
-SplitOption = Annotated[str | None, typer.Option(metavar="NAME", help="Folder of images, where there are several.")]
 
 
 def fetch_command(
@@ -39,7 +38,7 @@ def coco_command(
     boxes: Annotated[
         Literal["visible", "amodal"], typer.Option(help="Around the visible pixels, or around the whole object.")
     ] = "visible",
-    split: SplitOption = None,
+    split: Split = None,
 ) -> None:
     """Write one COCO file for the whole split.
 
@@ -54,7 +53,7 @@ def webdataset_command(
     images_per_shard: Annotated[int, typer.Option(min=1, metavar="N", help="Images in a shard, at most.")] = 1000,
     shuffle_seed: Annotated[int | None, typer.Option(metavar="N", help="Shuffle the images by this seed.")] = None,
     relabel_only: Annotated[bool, typer.Option("--relabel-only", help="Renew the labels of existing shards.")] = False,
-    split: SplitOption = None,
+    split: Split = None,
 ) -> None:
     """Write BOP webdataset shards.
 

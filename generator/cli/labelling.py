@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from generator.adopt import adopt
+from generator.cli.options import Workers
 from generator.formats.card import write_card
 from generator.relabel import relabel
 from generator.symmetry.detection import detect_folder, report
@@ -68,7 +69,7 @@ def detect_command(
         float, typer.Option(min=0, metavar="FACTOR", help="Millimetres per unit of the files; 1000 for metres.")
     ] = 1.0,
     pictures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for a picture of each part.")] = None,
-    workers: Annotated[int | None, typer.Option(min=1, metavar="N", help="Processes; default: one per core.")] = None,
+    workers: Workers = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
     """Find each mesh's symmetry group.

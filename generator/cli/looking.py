@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from generator.cli.making import EXIT_FAILED
+from generator.cli.options import Split, Workers
 from generator.doctor import examine, is_fit, to_json, to_text
 from generator.formats.files import read_json
 from generator.review.preview import write_preview
@@ -35,11 +36,9 @@ def preview_command(
     to: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder of the pages; default: preview, inside the dataset.")
     ] = None,
-    split: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Folder of images, where there are several.")
-    ] = None,
+    split: Split = None,
     images: Annotated[int | None, typer.Option(min=1, metavar="N", help="Show at most so many, evenly spread.")] = None,
-    workers: Annotated[int | None, typer.Option(min=1, metavar="N", help="Processes; default: one per core.")] = None,
+    workers: Workers = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the statistics as JSON.")] = False,
 ) -> None:
     """Make a gallery and statistics for the browser."""
