@@ -88,6 +88,10 @@ class Dataset:
         """The files of a scene folder."""
         return ScenePaths.of(self.root, scene_id, self.recipe.split)
 
+    def record(self, scene_id: int, im_id: int) -> Path:
+        """The record of an image."""
+        return self._records(scene_id) / f"{im_id:06d}.json"
+
     def done(self) -> set[int]:
         """Numbers of the images that exist."""
         return {
@@ -111,7 +115,7 @@ class Dataset:
         try:
             for name, content in image.files.items():
                 atomic_write(scene.root / name, content)
-            write_json(self._records(image.plan.scene_id) / f"{image.plan.im_id:06d}.json", record)
+            write_json(self.record(image.plan.scene_id, image.plan.im_id), record)
         except ValueError as error:
             raise DatasetError(str(error)) from error
 

@@ -76,8 +76,9 @@ def plots(of: Statistics) -> Iterator[tuple[str, bytes]]:
 def distribution_plot(of: Distribution) -> bytes:
     """Bars of what there is, a line of what was asked for."""
     names = [_short(name) for name in of.categories] if len(of.categories) <= _MOST_NAMES else []
-    upright = max(map(len, names), default=0) <= 3
-    height = 2.0 if upright else 2.0 + _LETTER_INCHES * max(map(len, names))
+    longest = max(map(len, names), default=0)
+    upright = longest <= 3
+    height = 2.0 if upright else 2.0 + _LETTER_INCHES * longest
     figure, axes = _figure(_width(len(of.categories)) if of.categories else 3.4, height)
     if of.categories:
         places = np.arange(len(of.counts), dtype=np.float64)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from generator.dataset import RECORDS_FOLDER
+from generator.dataset import RECORDS_FOLDER, Dataset
 from generator.formats.files import read_json
 from generator.review.validate.labels import SceneLabels
 from generator.review.validate.report import Finding, unusable
@@ -17,16 +17,16 @@ def check_records(source: Source, scene_id: int, labels: SceneLabels) -> Iterato
 
     A copy without any records is a whole dataset, too: it is only never gone on with.
     """
-    folder = source.root / RECORDS_FOLDER / f"{scene_id:06d}"
-    if not folder.parent.is_dir():
+    if not (source.root / RECORDS_FOLDER).is_dir():
         return
+    dataset = Dataset(source.root, source.recipe)
     files = (
         ("camera", labels.paths.scene_camera, labels.camera),
         ("gt", labels.paths.scene_gt, labels.gt),
         ("gt_info", labels.paths.scene_gt_info, labels.gt_info),
     )
     for im_id in labels.image_ids:
-        path = folder / f"{im_id:06d}.json"
+        path = dataset.record(scene_id, im_id)
         try:
             record = read_json(path)
         except ValueError as error:

@@ -68,11 +68,10 @@ def validate(
     n_deep_tasks = math.ceil(min(deep_images, source.recipe.images) / _DEEP_IMAGES_PER_TASK) if deep else 0
     tasks = list(_tasks(source, plans, limit))
     with processes(workers, max(len(tasks), n_deep_tasks)) as run:
-        scenes = []
-        for task, scene in zip(tasks, watched(run, check_scene, tasks, "validating", "part"), strict=True):
-            tally.merge(scene.tally)
-            if task.part == 0:
-                scenes.append(scene)
+        results = list(watched(run, check_scene, tasks, "validating", "part"))
+        for result in results:
+            tally.merge(result.tally)
+        scenes = [result for task, result in zip(tasks, results, strict=True) if task.part == 0]
         tally.add(_check_staleness(source, scenes))
         images, instances = sum(len(s.image_ids) for s in scenes), sum(s.instances for s in scenes)
         tally.add(check_counts(root, header, images, instances))

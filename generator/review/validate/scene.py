@@ -64,7 +64,7 @@ def check_scene(task: SceneTask) -> SceneResult:
     labels = SceneLabels.read(paths)
     sound, faults = check_poses(source.infos, labels)
     annotations = match_annotations(source, labels)
-    stale: tuple[int, ...] = ()
+    result = SceneResult(task.scene_id, tally)
     if task.part == 0:
         tally.add(labels.findings)
         tally.add(check_agreement(labels, task.plans))
@@ -76,10 +76,8 @@ def check_scene(task: SceneTask) -> SceneResult:
         labelling = check_canonical(source.symmetries, source.infos, labels, sound)
         tally.add(labelling.findings)
         tally.add(annotations.findings)
-        stale = labelling.stale
+        instances = sum(len(gt) for gt in labels.gt.values())
+        result = SceneResult(task.scene_id, tally, tuple(labels.gt), instances, labelling.stale)
     for im_id in labels.image_ids[task.part :: task.parts]:
         tally.add(ImageCheck(source, labels, im_id, annotations.by_image.get(im_id, {}), sound).run())
-    if task.part:
-        return SceneResult(task.scene_id, tally)
-    instances = sum(len(gt) for gt in labels.gt.values())
-    return SceneResult(task.scene_id, tally, tuple(labels.gt), instances, stale)
+    return result
