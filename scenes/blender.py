@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import sys
 from collections.abc import Iterator
@@ -65,6 +66,7 @@ def start(threads: int = 0, device: RenderDevice = CPU) -> Any:
     return bpy
 
 
+@functools.cache  # who asks again, twice a drop, need not put the path in order again
 def module() -> Any:
     """Import bpy, also in a process that was spawned from one that has it.
 
