@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,11 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     arguments.add_argument("--models", default="builtin", help="BOP models folder")
     arguments.add_argument("--textures", default="builtin", help="folder of photographs")
     return arguments
+
+
+def default_models() -> Path:
+    """The folder that SYNTHETLESS_TLESS_MODELS names, or else the parts that come with the project."""
+    return Path(os.environ.get("SYNTHETLESS_TLESS_MODELS", ROOT / "assets" / "parts"))
 
 
 def tless_recipe(arguments: argparse.Namespace, *overrides: str) -> Recipe:

@@ -7,7 +7,6 @@ CPU time of this process; of each scene the fastest of a few rounds, since other
 from __future__ import annotations
 
 import argparse
-import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks import ROOT, keep
+from benchmarks import default_models, keep
 from generator.annotation import PosedModel
 from generator.models import ObjectModel, load_models
 from generator.raycast import Plane, RayCaster
@@ -38,8 +37,7 @@ Scene = tuple[Plane, list[PosedModel]]
 def main() -> None:
     """Measure, print a table, write benchmarks/results/annotate.json."""
     parser = argparse.ArgumentParser(description=__doc__)
-    default = Path(os.environ.get("SYNTHETLESS_TLESS_MODELS", ROOT / "assets" / "parts"))
-    parser.add_argument("models", type=Path, nargs="?", default=default, help="a BOP models folder")
+    parser.add_argument("models", type=Path, nargs="?", default=default_models(), help="a BOP models folder")
     models = load_models(parser.parse_args().models)
 
     caster = RayCaster({obj_id: (model.vertices_mm, model.faces) for obj_id, model in models.items()})

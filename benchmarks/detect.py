@@ -8,12 +8,11 @@ With --markdown (T-LESS only) it writes docs/symmetry_tless.md, what was found b
 from __future__ import annotations
 
 import argparse
-import os
 import resource
 import time
 from pathlib import Path
 
-from benchmarks import ROOT, keep
+from benchmarks import ROOT, default_models, keep
 from generator.formats.files import atomic_write
 from generator.parallel import usable_cores
 from generator.symmetry.detection import Detected, DetectedFolder, DetectedObject, Finding, detect_folder
@@ -44,8 +43,7 @@ decision, and the residual table is there to make it.
 def main() -> None:
     """Measure, print a table, write benchmarks/results/detect.json and perhaps docs/symmetry_tless.md."""
     parser = argparse.ArgumentParser(description=__doc__)
-    default = Path(os.environ.get("SYNTHETLESS_TLESS_MODELS", ROOT / "assets" / "parts"))
-    parser.add_argument("models", type=Path, nargs="?", default=default, help="a BOP models folder")
+    parser.add_argument("models", type=Path, nargs="?", default=default_models(), help="a BOP models folder")
     parser.add_argument("--workers", type=int, default=usable_cores(), help="processes")
     parser.add_argument("--markdown", action="store_true", help="write docs/symmetry_tless.md")
     arguments = parser.parse_args()

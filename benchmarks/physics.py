@@ -7,7 +7,6 @@ Prints a table and writes benchmarks/results/physics.json. Needs Blender.
 from __future__ import annotations
 
 import argparse
-import os
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import ROOT, keep
+from benchmarks import default_models, keep
 from generator.models import load_models
 from scenes.mesh import Mesh
 from scenes.physics import Collider, NotSettled, PhysicsSettings, collider, settle
@@ -26,8 +25,7 @@ from scenes.spec import Pose
 def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__)
-    default = Path(os.environ.get("SYNTHETLESS_TLESS_MODELS", ROOT / "assets" / "parts"))
-    parser.add_argument("models", type=Path, nargs="?", default=default)
+    parser.add_argument("models", type=Path, nargs="?", default=default_models())
     parser.add_argument("--throws", type=int, default=30, help="per number of objects")
     parser.add_argument("--objects", type=int, nargs="+", default=[1, 3, 6, 10])
     arguments = parser.parse_args()
