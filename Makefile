@@ -28,7 +28,7 @@ test: setup  ## every test, real renders included
 
 interop: setup  ## the exports in trainers' own loaders: Hugging Face datasets, torch, torchvision (installs 1.3 GB)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[interop]'
-	$(BIN)/pytest tests/formats tests/review/test_dataset_card.py
+	$(BIN)/pytest tests/exports tests/dataset/test_card.py
 
 lint: setup  ## ruff and mypy --strict
 	$(BIN)/ruff check .
@@ -40,10 +40,10 @@ format: setup  ## let ruff rewrite what it can
 	$(BIN)/ruff format .
 
 parts: setup  ## model the built-in parts again (assets/parts)
-	$(BIN)/python -m assets.parts.build
+	$(BIN)/python -m synthetless.assets.parts.build
 
 docs: setup  ## write docs/recipe.md from the recipe's schema
-	$(BIN)/python -c "from generator.config import recipe_page; print(recipe_page(), end='')" > docs/recipe.md
+	$(BIN)/python -c "from synthetless.config import recipe_page; print(recipe_page(), end='')" > docs/recipe.md
 
 bench: setup  ## measure (see benchmarks/)
 	@set -e; for script in benchmarks/[a-z]*.py; do echo "== $$script"; $(BIN)/python -m benchmarks.$$(basename $$script .py); done

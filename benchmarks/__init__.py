@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from generator.config import Recipe, load_recipe
+from synthetless.config import Recipe, load_recipe
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"

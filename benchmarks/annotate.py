@@ -15,11 +15,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks import default_models, keep
-from generator.annotation import PosedModel
-from generator.models import ObjectModel, load_models
-from generator.raycast import Plane, RayCaster
-from scenes.camera import extrinsics
-from scenes.spec import Intrinsics, View
+from synthetless.annotation.instances import PosedModel
+from synthetless.annotation.raycast import Plane, RayCaster
+from synthetless.io.models import ObjectModel, load_models
+from synthetless.scenes.camera import extrinsics
+from synthetless.scenes.spec import Intrinsics, View
 
 CAMERA = Intrinsics(width=720, height=540, fx=1075.65091572, fy=1073.90347929, cx=360.0, cy=270.0)
 HALF_TABLE_MM = 3000.0

@@ -13,10 +13,10 @@ import time
 from pathlib import Path
 
 from benchmarks import ROOT, default_models, keep
-from generator.formats.files import atomic_write
-from generator.parallel import usable_cores
-from generator.symmetry.detection import Detected, DetectedFolder, DetectedObject, Finding, detect_folder
-from generator.symmetry.detection.report import axis_text
+from synthetless.io.files import atomic_write
+from synthetless.io.parallel import usable_cores
+from synthetless.symmetry.detection import Detected, DetectedFolder, DetectedObject, Finding, detect_folder
+from synthetless.symmetry.detection.report import axis_text
 
 PAGE = ROOT / "docs" / "symmetry_tless.md"
 

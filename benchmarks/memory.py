@@ -12,9 +12,9 @@ import numpy as np
 import psutil
 
 from benchmarks import keep, parser, tless_recipe
-from generator.plan import plan_image
-from generator.sources import load_sources
-from generator.studio import Studio
+from synthetless.dataset.layout import plan_image
+from synthetless.generation.drop import Studio
+from synthetless.generation.sources import load_sources
 
 WARM = 20
 """After so many drops every mesh has been seen."""

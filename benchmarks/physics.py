@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import default_models, keep
-from generator.models import load_models
-from scenes.mesh import Mesh
-from scenes.physics import Collider, NotSettled, PhysicsSettings, collider, settle
-from scenes.rotations import random_rotation
-from scenes.spec import Pose
+from synthetless.io.models import load_models
+from synthetless.scenes.mesh import Mesh
+from synthetless.scenes.physics import Collider, NotSettled, PhysicsSettings, collider, settle
+from synthetless.scenes.rotations import random_rotation
+from synthetless.scenes.spec import Pose
 
 
 def main() -> None:

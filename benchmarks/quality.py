@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import RESULTS, keep, parser, tless_recipe
-from generator.config import Recipe
-from generator.develop import develop, exposure_gain
-from generator.formats.images import decode_rgb, encode_jpeg, encode_png
-from generator.sources import load_sources
-from generator.studio import Studio
-from scenes.render import Stage
-from scenes.settings import RenderSettings
+from synthetless.config import Recipe
+from synthetless.generation.drop import Studio
+from synthetless.generation.sources import load_sources
+from synthetless.io.color import develop, exposure_gain
+from synthetless.io.images import decode_rgb, encode_jpeg, encode_png
+from synthetless.scenes.render import Stage
+from synthetless.scenes.settings import RenderSettings
 
 SHRINK = 2
 

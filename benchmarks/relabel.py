@@ -19,12 +19,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks import ROOT, keep
-from generator.formats.bop import ScenePaths, camera_entry, gt_entry, write_scene_json
-from generator.formats.files import write_json
-from generator.models import INFO_FILE, read_models_info
-from generator.parallel import usable_cores
-from generator.relabel import relabel
-from generator.symmetry import SymmetryTable
+from synthetless.dataset.layout import ScenePaths
+from synthetless.dataset.records import camera_entry, gt_entry, write_scene_json
+from synthetless.dataset.relabel import relabel
+from synthetless.io.files import write_json
+from synthetless.io.models import INFO_FILE, read_models_info
+from synthetless.io.parallel import usable_cores
+from synthetless.symmetry import SymmetryTable
 
 N_SCENES, N_IMAGES, N_INSTANCES = 30, 1000, 5
 K = np.array([[1075.0, 0.0, 200.0], [0.0, 1075.0, 200.0], [0.0, 0.0, 1.0]])

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import keep, parser, tless_recipe
-from generator.config import Recipe
-from generator.dataset import RECORDS_FOLDER
-from generator.generate import Execution, generate
+from synthetless.config import Recipe
+from synthetless.dataset.layout import RECORDS_FOLDER
+from synthetless.generation.generate import Execution, generate
 
 
 def main() -> None:

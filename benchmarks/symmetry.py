@@ -15,9 +15,9 @@ import time
 import numpy as np
 
 from benchmarks import keep
-from generator.symmetry import CanonicalMap, SymmetryGroup
-from generator.symmetry.atlas import SCHEMES
-from generator.symmetry.quaternions import normalise, to_matrix
+from synthetless.symmetry import CanonicalMap, SymmetryGroup
+from synthetless.symmetry.atlas import SCHEMES
+from synthetless.symmetry.quaternions import normalise, to_matrix
 
 GROUPS = ("C1", "C2", "C4", "C6", "C12", "D2", "D3", "D6", "T", "O", "I", "SO(2)", "O(2)", "SO(3)")
 REPETITIONS = 5

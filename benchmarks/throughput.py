@@ -15,12 +15,12 @@ import time
 from pathlib import Path
 
 from benchmarks import keep, parser, tless_recipe
-from generator import device
-from generator.config import Recipe
-from generator.dataset import Dataset
-from generator.plan import plan_image
-from generator.sources import load_sources
-from generator.studio import Studio
+from synthetless.config import Recipe
+from synthetless.dataset.layout import plan_image
+from synthetless.dataset.store import Dataset
+from synthetless.generation import devices
+from synthetless.generation.drop import Studio
+from synthetless.generation.sources import load_sources
 
 STAGES = {
     "sample": [("sampling.py", "sample_scene")],
@@ -65,7 +65,7 @@ def measure(recipe: Recipe, images: int, wanted: str) -> dict[str, float]:
         sources = load_sources(recipe)
         dataset = Dataset.open(Path(folder) / "dataset", recipe, sources.models, sources.scenery_digest)
         began = time.perf_counter()
-        studio = Studio(recipe, sources, 1, device.take(device.choose(wanted)), log)
+        studio = Studio(recipe, sources, 1, devices.take(devices.choose(wanted)), log)
         stages = {"start": time.perf_counter() - began}
         # What is made once for each model, whatever the number of images, is made now.
         studio.stage.configure(recipe.render.model_copy(update={"samples": 1, "denoiser": "none"}))

@@ -17,17 +17,16 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from benchmarks import ROOT, keep
-from generator.config import Recipe, load_recipe
-from generator.dataset import MODELS_FOLDER, Dataset, FinishedImage
-from generator.formats import bop
-from generator.formats.bop import ScenePaths
-from generator.formats.files import read_json, read_json_lines
-from generator.generate import Execution, generate
-from generator.models import load_models
-from generator.parallel import usable_cores
-from generator.plan import ImagePlan, plan_image
-from generator.replay import read_recipe
-from generator.review.validate import validate
+from synthetless.config import Recipe, load_recipe
+from synthetless.dataset import records
+from synthetless.dataset.layout import MODELS_FOLDER, ImagePlan, ScenePaths, plan_image
+from synthetless.dataset.store import Dataset, FinishedImage
+from synthetless.generation.generate import Execution, generate
+from synthetless.generation.rerender import read_recipe
+from synthetless.io.files import read_json, read_json_lines
+from synthetless.io.models import load_models
+from synthetless.io.parallel import usable_cores
+from synthetless.validation import validate
 
 PAPERS_IMAGES = 30_000
 MADE = 8
@@ -84,8 +83,8 @@ def _repeat(source: Path, root: Path, n_images: int) -> None:
 
 def _images(dataset: Path, recipe: Recipe) -> list[FinishedImage]:
     scene = ScenePaths.of(dataset, 1, recipe.split)
-    cameras, gts = bop.read_scene_json(scene.scene_camera), bop.read_scene_json(scene.scene_gt)
-    infos, specs = bop.read_scene_json(scene.scene_gt_info), read_json_lines(scene.scene_spec)
+    cameras, gts = records.read_scene_json(scene.scene_camera), records.read_scene_json(scene.scene_gt)
+    infos, specs = records.read_scene_json(scene.scene_gt_info), read_json_lines(scene.scene_spec)
     annotations = read_json(scene.scene_gt_coco)["annotations"]
     return [
         FinishedImage(

@@ -1,5 +1,5 @@
-"""``python -m generator`` is the command ``synthetless``."""
+"""``python -m synthetless`` is the command ``synthetless``."""
 
-from generator.cli import main
+from synthetless.cli.app import main
 
 main()

@@ -1,7 +1,7 @@
 """The recipe: one tree of settings that is the YAML file, the ``--set`` overrides and what a dataset records.
 
-Settings of the scene itself live in :mod:`scenes.settings`; this adds the seed, the sources, the files written and
-the labels, and reads, overrides and documents the whole tree.
+Settings of the scene itself live in :mod:`synthetless.scenes.settings`; this adds the seed, the sources, the files
+written and the labels, and reads, overrides and documents the whole tree.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from typing import Annotated, Any, Literal, get_args
 import yaml
 from pydantic import Field, ValidationError
 
-from scenes.settings import Bounds, SceneSettings, Settings
-from scenes.spec import Intrinsics
+from synthetless.errors import UserError
+from synthetless.scenes.settings import Bounds, SceneSettings, Settings
+from synthetless.scenes.spec import Intrinsics
 
 BUILTIN = "builtin"
 Output = Literal["rgb", "depth", "masks", "normals", "object_coordinates", "exr"]
@@ -27,7 +28,7 @@ _EXPECTED = {"tuple_type": "expected a list, such as [min, max]", "model_type": 
 """Faults whose wording by pydantic would speak of Python instead of the recipe."""
 
 
-class RecipeError(ValueError):
+class RecipeError(UserError):
     """A recipe or an override that cannot be used; the message is one line."""
 
 

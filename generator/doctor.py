@@ -1,6 +1,6 @@
 """Whether this machine can make datasets, and what to do where it cannot.
 
-What the machine is like, ``generator.machine`` finds out; here it is judged, by functions of nothing but that.
+What the machine is like, ``synthetless.generation.machine`` finds out; here it is judged, by functions of that alone.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from generator import machine
-from generator.machine import Answer
-from generator.parallel import usable_cores
+from synthetless.generation import machine
+from synthetless.generation.machine import Answer
+from synthetless.io.parallel import usable_cores
 
 PYTHON = (3, 11)
 BLENDER = "4.5"

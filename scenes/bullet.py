@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from scenes import blender
+from synthetless.scenes import blender
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scenes.spec import Intrinsics, View
+from synthetless.scenes.spec import Intrinsics, View
 
 _SENSOR_WIDTH_MM = 36.0
 _CV_TO_BLENDER = np.diag([1.0, -1.0, -1.0])

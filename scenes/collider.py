@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
-from scenes.contact import Surface
-from scenes.mesh import Mesh
+from synthetless.errors import UserError
+from synthetless.scenes.contact import Surface
+from synthetless.scenes.mesh import Mesh
 
 Array = NDArray[np.float64]
 
@@ -60,10 +61,10 @@ def collider(mesh: Mesh) -> Collider:
     """Prepare a mesh for physics: about half a second, so keep the result.
 
     Raises:
-        ValueError: the mesh is flat.
+        UserError: the mesh is flat.
     """
     if not len(mesh.faces) or np.linalg.matrix_rank(np.diff(mesh.vertices_m[np.unique(mesh.faces)], axis=0)) < 3:
-        raise ValueError("the mesh is flat; a body needs a volume to fall")
+        raise UserError("the mesh is flat; a body needs a volume to fall")
     surface = Surface(mesh)
     points = np.concatenate([surface.vertices_m, surface.points_m])
     voxels = _Voxels(surface.points_m, 2 * surface.spacing_m)

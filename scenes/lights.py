@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scenes.spec import AmbientLight, PointLight
+from synthetless.scenes.spec import AmbientLight, PointLight
 
 
 def lamp_power_w(light: PointLight) -> float:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.spec import Material, PlaneSpec
+from synthetless.scenes.spec import Material, PlaneSpec
 
 
 def plastic(bpy: Any, material: Material) -> Any:

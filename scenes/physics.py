@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from scenes.bullet import RigidWorld
-from scenes.collider import Collider, collider
-from scenes.contact import Contacts, Posed, measure
-from scenes.rotations import matrix
-from scenes.spec import Pose
+from synthetless.scenes.bullet import RigidWorld
+from synthetless.scenes.collider import Collider, collider
+from synthetless.scenes.contact import Contacts, Posed, measure
+from synthetless.scenes.rotations import matrix
+from synthetless.scenes.spec import Pose
 
 __all__ = ["Collider", "NotSettled", "PhysicsSettings", "Settled", "collider", "settle"]
 

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from scenes import blender
-from scenes.mesh import Mesh
-from scenes.render import Stage
-from scenes.sampling import Catalogue, sample_scene
-from scenes.settings import ObjectSettings, SceneSettings
-from scenes.spec import Intrinsics, Pose
+from synthetless.scenes import blender
+from synthetless.scenes.mesh import Mesh
+from synthetless.scenes.render import Stage
+from synthetless.scenes.sampling import Catalogue, sample_scene
+from synthetless.scenes.settings import ObjectSettings, SceneSettings
+from synthetless.scenes.spec import Intrinsics, Pose
 
 
 def devices() -> dict[str, Any]:

@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes import blender, camera, lights, materials
-from scenes.blender import RenderDevice
-from scenes.mesh import Mesh
-from scenes.rotations import matrix
-from scenes.settings import RenderSettings
-from scenes.spec import Intrinsics, Pose, Role, SceneSpec
-from scenes.textures import PhotoTexture, load_photo, procedural_image
+from synthetless.errors import UserError
+from synthetless.scenes import blender, camera, lights, materials
+from synthetless.scenes.blender import RenderDevice
+from synthetless.scenes.mesh import Mesh
+from synthetless.scenes.rotations import matrix
+from synthetless.scenes.settings import RenderSettings
+from synthetless.scenes.spec import Intrinsics, Pose, Role, SceneSpec
+from synthetless.scenes.textures import PhotoTexture, load_photo, procedural_image
 
 _CREASE_DEG = 30.0
 """Edges sharper than this are shaded as edges."""
@@ -68,7 +69,7 @@ class Stage:
             settled: pose of each object of ``spec`` at rest.
 
         Raises:
-            ValueError: the photograph of the table cannot be read.
+            UserError: the photograph of the table cannot be read.
         """
         bpy_scene = self.bpy.context.scene
         collection = bpy_scene.collection
@@ -96,7 +97,7 @@ class Stage:
         texture = spec.plane.texture
         if isinstance(texture, PhotoTexture):
             if self.photos is None:
-                raise ValueError(f"the scene needs the photograph {texture.file}, but no textures folder is given")
+                raise UserError(f"the scene needs the photograph {texture.file}, but no textures folder is given")
             pixels = load_photo(self.photos, texture.file)
         else:
             pixels = procedural_image(texture)

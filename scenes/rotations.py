@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.spec import Quaternion
+from synthetless.scenes.spec import Quaternion
 
 
 def random_rotation(rng: np.random.Generator) -> Quaternion:

@@ -13,8 +13,8 @@ from enum import IntEnum
 
 import numpy as np
 
-from scenes.rotations import random_rotation
-from scenes.settings import (
+from synthetless.scenes.rotations import random_rotation
+from synthetless.scenes.settings import (
     CameraSettings,
     FloatRange,
     LightSettings,
@@ -23,7 +23,7 @@ from scenes.settings import (
     SceneSettings,
     TableSettings,
 )
-from scenes.spec import (
+from synthetless.scenes.spec import (
     AmbientLight,
     Material,
     ObjectSpec,
@@ -35,7 +35,7 @@ from scenes.spec import (
     Vector,
     View,
 )
-from scenes.textures import sample_texture
+from synthetless.scenes.textures import sample_texture
 
 _CANDLE = (1.0, 0.56, 0.17)
 """Linear RGB of a black body at about 2000 K, largest component 1."""

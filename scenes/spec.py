@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from scenes.textures import PhotoTexture, ProceduralTexture
+from synthetless.scenes.textures import PhotoTexture, ProceduralTexture
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

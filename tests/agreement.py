@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes import camera
-from scenes.render import BuiltScene
+from synthetless.scenes import camera
+from synthetless.scenes.render import BuiltScene
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import valid_dataset
+from bop_dataset import build_dataset, dataset  # noqa: F401  (fixtures)
 from hypothesis import settings
 
 settings.register_profile("synthetless", deadline=None)  # a busy machine is no fault of the code
@@ -37,3 +40,24 @@ def photo_textures() -> Path:
 def builtin_models() -> Path:
     """The parts that come with the project."""
     return ROOT / "assets" / "parts"
+
+
+@pytest.fixture
+def small_scene_folders() -> Iterator[None]:
+    """Three images a scene folder, so that six images fill two."""
+    with valid_dataset.small_scene_folders():
+        yield
+
+
+@pytest.fixture(scope="session")
+def parts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A models folder of a few parts with symmetries of every kind."""
+    return valid_dataset.write_models(tmp_path_factory.mktemp("parts") / "models")
+
+
+@pytest.fixture(scope="session")
+def valid(tmp_path_factory: pytest.TempPathFactory, parts: Path) -> Path:
+    """A valid dataset of six images in two scene folders, for tests that only read it."""
+    root = tmp_path_factory.mktemp("valid") / "dataset"
+    valid_dataset.write_dataset(root, parts)
+    return root

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from generator.config import load_recipe
-from generator.dataset import Dataset, FinishedImage
-from generator.formats import bop
-from generator.formats.bop import Entry
-from generator.models import ObjectModel
-from generator.plan import plan_image
+from synthetless.config import load_recipe
+from synthetless.dataset import records
+from synthetless.dataset.layout import plan_image
+from synthetless.dataset.records import Entry
+from synthetless.dataset.store import Dataset, FinishedImage
+from synthetless.io.models import ObjectModel
 
 K = np.array([[1075.65, 0.0, 360.0], [0.0, 1073.9, 270.0], [0.0, 0.0, 1.0]])
 NUMBERS = (0, 1, 2, 1000, 1001, 2000)
@@ -25,13 +25,13 @@ def random_poses(rng: np.random.Generator, obj_ids: Sequence[int], count: int) -
     rotations = Rotation.random(count, random_state=rng).as_matrix()
     places_mm = rng.uniform([-150, -150, 650], [150, 150, 900], (count, 3))
     chosen = rng.choice(obj_ids, count)
-    return [bop.gt_entry(int(obj_id), R, t) for obj_id, R, t in zip(chosen, rotations, places_mm, strict=True)]
+    return [records.gt_entry(int(obj_id), R, t) for obj_id, R, t in zip(chosen, rotations, places_mm, strict=True)]
 
 
 def random_camera(rng: np.random.Generator) -> Entry:
     """An entry of scene_camera.json; the focal length varies, so that a camera mixed up is noticed."""
     focal = np.diag([rng.uniform(0.9, 1.1), rng.uniform(0.9, 1.1), 1.0])
-    return bop.camera_entry(K @ focal, np.eye(3), np.array([0.0, 0.0, 700.0]), 0.1)
+    return records.camera_entry(K @ focal, np.eye(3), np.array([0.0, 0.0, 700.0]), 0.1)
 
 
 def open_dataset(root: Path, models: Mapping[int, ObjectModel], images: int = 2001) -> Dataset:

@@ -8,45 +8,72 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parents[1]
-MODULES = sorted(path for room in ("generator", "scenes", "assets") for path in (ROOT / room).rglob("*.py"))
-WITHOUT_BLENDER = ("symmetry", "formats", "review", "labels.py", "relabel.py", "adopt.py", "raycast.py")
+FOLDERS = {"generator": "synthetless", "scenes": "synthetless.scenes", "assets": "synthetless.assets"}
+
+FLOORS = (
+    {"errors", "assets"},
+    {"scenes"},
+    {"io", "config"},
+    {"annotation"},
+    {"symmetry"},
+    {"dataset"},
+    {"generation", "exports"},
+    {"validation", "preview", "fetch", "doctor"},
+    {"cli"},
+    {"__main__"},
+)
+"""The rooms of the package, from the bottom: each imports from the floors below it, and from itself."""
+
+WITHOUT_BLENDER = {"config", "io", "annotation", "symmetry", "dataset", "exports", "validation", "preview"}
 
 
-def _imports(tree: ast.AST) -> Iterator[str]:
-    for node in ast.walk(tree):
+def _modules() -> Iterator[tuple[str, Path]]:
+    """Dotted name and file of every module of the package."""
+    for folder, package in FOLDERS.items():
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            parts = path.relative_to(ROOT / folder).with_suffix("").parts
+            yield ".".join([package, *parts]).removesuffix(".__init__"), path
+
+
+MODULES = dict(_modules())
+
+
+def _room(module: str) -> str:
+    return module.split(".")[1] if "." in module else "package"
+
+
+def _imports(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
-            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def _packages(path: Path) -> set[str]:
-    return {name.partition(".")[0] for name in _imports(ast.parse(path.read_text(encoding="utf-8")))}
+def test_every_room_has_a_floor() -> None:
+    assert {_room(module) for module in MODULES} - {"package"} == set().union(*FLOORS)
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_imports_go_one_way(path: Path) -> None:
-    room = path.relative_to(ROOT).parts[0]
-    imported = _packages(path)
-    if room == "generator":
-        assert not imported & {"bpy", "mathutils"}, "generator never imports Blender"
-    if room == "scenes":
-        assert "generator" not in imported, "scenes never imports generator"
-    if room == "assets":
-        assert not imported & {"bpy", "mathutils", "scenes", "generator"}
-    assert "tests" not in imported
+def test_imports_go_one_way() -> None:
+    floor = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
+    wrong = []
+    for module, path in MODULES.items():
+        here = _room(module)
+        for name in _imports(path):
+            there = _room(name) if name.startswith("synthetless.") else here
+            if there != here and floor.get(there, 99) >= floor.get(here, 0):
+                wrong.append(f"{module} imports {name}")
+            if name.split(".")[0] in {"generator", "scenes", "assets", "tests"}:
+                wrong.append(f"{module} imports {name}: the package's name is synthetless")
+            if name.split(".")[0] in {"bpy", "mathutils"} and here != "scenes":
+                wrong.append(f"{module} imports {name}: Blender is met in scenes alone")
+    assert not wrong, "\n".join(wrong)
 
 
-def test_labels_formats_and_review_run_where_blender_is_not_installed() -> None:
-    """Import them with bpy, mathutils and OpenEXR made impossible."""
-    names = []
-    for path in MODULES:
-        parts = path.relative_to(ROOT).parts
-        if parts[0] == "generator" and parts[1] in WITHOUT_BLENDER and parts[-1] != "__main__.py":
-            names.append(".".join(parts).removesuffix(".py").removesuffix(".__init__"))
+def test_what_needs_no_blender_runs_where_it_is_not_installed() -> None:
+    """Import it with bpy, mathutils and OpenEXR made impossible."""
+    names = [module for module in MODULES if _room(module) in WITHOUT_BLENDER]
     assert len(names) > 20
     code = (
         "import sys, importlib\n"
@@ -57,23 +84,31 @@ def test_labels_formats_and_review_run_where_blender_is_not_installed() -> None:
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_nothing_is_drawn_from_a_global_generator(path: Path) -> None:
+def test_nothing_is_drawn_from_a_global_generator() -> None:
     """np.random.seed, np.random.rand and the random module would tie an image to what was made before it."""
     allowed = {"default_rng", "Generator", "SeedSequence", "PCG64", "BitGenerator"}
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    assert "random" not in _packages(path)
-    for node in ast.walk(tree):
-        if (
-            isinstance(node, ast.Attribute)
-            and isinstance(node.value, ast.Attribute)
-            and node.value.attr == "random"
-            and isinstance(node.value.value, ast.Name)
-            and node.value.value.id in {"np", "numpy"}
-        ):
-            assert node.attr in allowed, f"line {node.lineno}: np.random.{node.attr}"
+    wrong = []
+    for module, path in MODULES.items():
+        if any(name.split(".")[0] == "random" for name in _imports(path)):
+            wrong.append(f"{module} imports random")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            is_random = isinstance(node, ast.Attribute) and ast.unparse(node.value) in {"np.random", "numpy.random"}
+            if is_random and node.attr not in allowed:
+                wrong.append(f"{module}, line {node.lineno}: {ast.unparse(node)}")
+    assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_modules_can_be_read_from_top_to_bottom(path: Path) -> None:
-    assert len(path.read_text(encoding="utf-8").splitlines()) <= 330
+def test_importing_the_package_works_beside_files_of_the_same_names(tmp_path: Path) -> None:
+    """A user's own generator.py, scenes/ and assets/ neither hide the package's rooms nor are hidden by them."""
+    for name in ("generator", "scenes", "assets"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("MINE = True\n")
+    code = (
+        "import generator, scenes, assets\n"
+        "assert generator.MINE and scenes.MINE and assets.MINE\n"
+        "from synthetless.symmetry import CanonicalMap, SymmetryGroup, SymmetryTable\n"
+        "import synthetless.scenes.spec, synthetless.assets\n"
+        "print(SymmetryGroup.from_name('C2').name)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.stdout == "C2\n", done.stderr

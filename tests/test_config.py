@@ -10,7 +10,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from generator.config import Recipe, RecipeError, dump_recipe, load_recipe, settings
+from synthetless.config import Recipe, RecipeError, dump_recipe, load_recipe, settings
 
 ROOT = Path(__file__).resolve().parents[1]
 RECIPES = sorted((ROOT / "configs").glob("*.yaml"))
@@ -108,7 +108,7 @@ def test_every_default_survives_being_set(key: str) -> None:
 
 def test_the_reference_page_is_up_to_date() -> None:
     page = (ROOT / "docs" / "recipe.md").read_text(encoding="utf-8")
-    from generator.config import recipe_page
+    from synthetless.config import recipe_page
 
     assert page == recipe_page(), "run `make docs`"
 

@@ -12,10 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from generator import doctor, machine
-from generator.doctor import Check, Status, examine, is_fit, to_json, to_text
-from generator.machine import Answer, ask
-from scenes.settings import RenderSettings
+from synthetless import doctor
+from synthetless.doctor import Check, Status, examine, is_fit, to_json, to_text
+from synthetless.generation import machine
+from synthetless.generation.machine import Answer, ask
+from synthetless.scenes.settings import RenderSettings
 
 STATUSES: tuple[Status, ...] = ("ok", "warn", "fail")
 

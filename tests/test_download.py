@@ -26,7 +26,7 @@ from fetch_server import (
     trickle,
 )
 
-from generator.fetch.download import DownloadError, Persistence, download
+from synthetless.fetch.download import DownloadError, Persistence, download
 
 MB = 1_000_000
 

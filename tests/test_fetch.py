@@ -23,10 +23,10 @@ from fetch_server import QUICK, Server, break_off, fail, files_of_at_most, redir
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from generator.fetch import ArchiveError, DownloadError, FetchReport, fetch, obtain
-from generator.fetch.archive import Limits, Member, open_archive, unpack
-from generator.fetch.sources import DTD, TLESS, TLESS_DIAMETERS_MM, DataSource, check_dtd, diameter_mm
-from generator.models import load_models
+from synthetless.fetch import ArchiveError, DownloadError, FetchReport, fetch, obtain
+from synthetless.fetch.archive import Limits, Member, open_archive, unpack
+from synthetless.fetch.sources import DTD, TLESS, TLESS_DIAMETERS_MM, DataSource, check_dtd, diameter_mm
+from synthetless.io.models import load_models
 
 MB = 1_000_000
 

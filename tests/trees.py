@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
-from generator.workers import LOGS_FOLDER
+from synthetless.dataset.layout import LOGS_FOLDER
 
 SHARED_LOCK = ".synthetless.lock"
 """Runs that make parts of a dataset hold it together, so that none of them takes it away."""

@@ -2,7 +2,7 @@
 
 from manifold3d import Manifold
 
-from assets.parts.features import (
+from synthetless.assets.parts.features import (
     around,
     at,
     at_each,

@@ -1,4 +1,7 @@
-"""Model the built-in parts again: `python -m assets.parts.build [FOLDER]` writes obj_%06d.ply and models_info.json."""
+"""Model the built-in parts again: ``python -m synthetless.assets.parts.build [FOLDER]``.
+
+Writes obj_%06d.ply and models_info.json.
+"""
 
 import sys
 from pathlib import Path
@@ -7,9 +10,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from assets.parts.catalogue import PARTS, Part
-from assets.parts.mesh import box_centre, model_info, on_grid, ply_bytes, write_models_info
-from assets.parts.sectors import FloatArray, Surface, is_closed, rotations, surface_of, symmetrised
+from synthetless.assets.parts.catalogue import PARTS, Part
+from synthetless.assets.parts.mesh import box_centre, model_info, on_grid, ply_bytes, write_models_info
+from synthetless.assets.parts.sectors import FloatArray, Surface, is_closed, rotations, surface_of, symmetrised
 
 CONTINUOUS_AXES = {"SO(2)": ["z"], "O(2)": ["z"], "SO(3)": ["z", "x"]}
 LAID_OVER = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # the model's z becomes the file's y

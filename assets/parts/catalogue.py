@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from manifold3d import Manifold
 
-from assets.parts import adapters, boxes, cylinders, extras
+from synthetless.assets.parts import adapters, boxes, cylinders, extras
 
 
 @dataclass(frozen=True)

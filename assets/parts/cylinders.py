@@ -2,7 +2,7 @@
 
 from manifold3d import Manifold
 
-from assets.parts.features import Profile, lathe, thread
+from synthetless.assets.parts.features import Profile, lathe, thread
 
 
 def _holder_inside(bore: float, rim: float, depth: float, contact: float = 4.0) -> Profile:

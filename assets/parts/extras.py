@@ -4,7 +4,7 @@ from math import cos, pi
 
 from manifold3d import Manifold
 
-from assets.parts.features import (
+from synthetless.assets.parts.features import (
     Profile,
     around,
     at,

@@ -10,7 +10,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
-from assets.parts.sectors import FloatArray, IntArray, Surface
+from synthetless.assets.parts.sectors import FloatArray, IntArray, Surface
 
 GRID_MM = 2.0**-14  # a power of two: float32 holds every coordinate, and half of one, without rounding
 NORMAL_DECIMALS = 6  # below float32's own precision: no last bit depends on the machine's order of summing

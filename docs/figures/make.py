@@ -19,12 +19,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from generator.annotation import PosedModel
-from generator.models import ObjectModel, load_models
-from generator.raycast import RayCaster
-from generator.symmetry import CanonicalMap, CanonicalPoses, SymmetryGroup
-from generator.symmetry.atlas import SCHEMES, Scheme
-from scenes.spec import Intrinsics
+from synthetless.annotation.instances import PosedModel
+from synthetless.annotation.raycast import RayCaster
+from synthetless.io.models import ObjectModel, load_models
+from synthetless.scenes.spec import Intrinsics
+from synthetless.symmetry import CanonicalMap, CanonicalPoses, SymmetryGroup
+from synthetless.symmetry.atlas import SCHEMES, Scheme
 
 Floats = NDArray[np.float64]
 

@@ -23,13 +23,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from generator.formats import bop, images
-from generator.formats.bop import Entry, ScenePaths
-from generator.formats.files import atomic_write, read_bytes
-from generator.labels import box_corners_mm
-from generator.models import read_models_info
-from generator.review.preview.overlays import Segment, axis_lines, box_lines
-from generator.review.sheet import class_color
+from synthetless.dataset import records
+from synthetless.dataset.labels import box_corners_mm
+from synthetless.dataset.layout import ScenePaths, find_split
+from synthetless.dataset.records import Entry
+from synthetless.dataset.sheet import class_color
+from synthetless.io import images
+from synthetless.io.files import atomic_write, read_bytes
+from synthetless.io.models import read_models_info
+from synthetless.preview.overlays import Segment, axis_lines, box_lines
 
 IMAGES = Path(__file__).resolve().parents[1] / "images"
 PLOT = "near_jump"
@@ -43,12 +45,12 @@ Color = tuple[int, int, int]
 
 def overlay(dataset: Path, im_id: int) -> Picture:
     """The image cut to its objects, twice: left masks and true poses, right masks and canonical poses."""
-    scene = ScenePaths.of(dataset, 1, bop.find_split(dataset))
+    scene = ScenePaths.of(dataset, 1, find_split(dataset))
     path = next(path for path in (scene.rgb(im_id, "png"), scene.rgb(im_id, "jpg")) if path.exists())
     rgb = images.decode_rgb(read_bytes(path), path)
-    truth = bop.read_scene_json(scene.scene_gt)[im_id]
-    canonical = bop.read_scene_json(scene.scene_gt_canonical)[im_id]
-    K = np.array(bop.read_scene_json(scene.scene_camera)[im_id]["cam_K"]).reshape(3, 3)
+    truth = records.read_scene_json(scene.scene_gt)[im_id]
+    canonical = records.read_scene_json(scene.scene_gt_canonical)[im_id]
+    K = np.array(records.read_scene_json(scene.scene_camera)[im_id]["cam_K"]).reshape(3, 3)
     infos = read_models_info(dataset / "models")
     paths = [scene.mask_visib(im_id, gt_id) for gt_id in range(len(truth))]
     masks = [images.decode_mask(read_bytes(path), path) for path in paths]

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from generator.fetch.archive import ArchiveError, Member, folder_members, open_archive, unpack
-from generator.fetch.download import DownloadError, Persistence, download, is_address
-from generator.fetch.sources import SOURCES, DataSource
-from generator.formats.files import atomic_folder, atomic_write
+from synthetless.errors import UserError
+from synthetless.fetch.archive import ArchiveError, Member, folder_members, open_archive, unpack
+from synthetless.fetch.download import DownloadError, Persistence, download, is_address
+from synthetless.fetch.sources import SOURCES, DataSource
+from synthetless.io.files import atomic_folder, atomic_write
 
 __all__ = ["ArchiveError", "DownloadError", "FetchReport", "Persistence", "fetch", "obtain"]
 
@@ -56,10 +57,10 @@ def fetch(what: Literal["tless", "dtd"], to: Path, source: str | None = None) ->
             publisher the archive's checksum must be right; from wherever, the content.
 
     Raises:
-        ValueError: it cannot be had, is damaged or is something else, or cannot be written.
+        UserError: it cannot be had, is damaged or is something else, or cannot be written.
     """
     if what not in SOURCES:
-        raise ValueError(f"{what}: nothing known of that name; {' or '.join(SOURCES)} can be fetched")
+        raise UserError(f"{what}: nothing known of that name; {' or '.join(SOURCES)} can be fetched")
     return obtain(SOURCES[what], to, source)
 
 

@@ -20,6 +20,8 @@ from functools import partial
 from pathlib import Path
 from typing import IO
 
+from synthetless.errors import UserError
+
 _CHUNK_BYTES = 1 << 20
 _DAMAGE = (
     *(zipfile.BadZipFile, tarfile.TarError, lzma.LZMAError, zlib.error, EOFError),
@@ -27,7 +29,7 @@ _DAMAGE = (
 )
 
 
-class ArchiveError(ValueError):
+class ArchiveError(UserError):
     """An archive that is damaged, dangerous or holds something else; the message is one line."""
 
 

@@ -18,7 +18,8 @@ from typing import Any, BinaryIO
 
 from tqdm import tqdm
 
-from generator.formats.files import atomic_write
+from synthetless.errors import UserError
+from synthetless.io.files import atomic_write
 
 _log = logging.getLogger(__name__)
 
@@ -27,7 +28,7 @@ _TRY_AGAIN = {408, 425, 429, 500, 502, 503, 504}
 _RANGE_NOT_SATISFIABLE = 416
 
 
-class DownloadError(ValueError):
+class DownloadError(UserError):
     """A file that cannot be had; the message is one line."""
 
 

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
-from generator.fetch.archive import Limits
-from generator.models import load_models
+from synthetless.errors import UserError
+from synthetless.fetch.archive import Limits
+from synthetless.io.models import load_models
 
 TLESS_DIAMETERS_MM = (
     *(63.515, 66.151, 65.349, 80.726, 108.690, 108.265, 178.615, 217.156, 144.546, 90.211),
@@ -63,17 +64,17 @@ def check_tless(folder: Path) -> None:
     """The 30 T-LESS CAD models, recognised by their diameters.
 
     Raises:
-        ValueError: one is missing, unreadable, of another size than models_info.json says, or another object.
+        UserError: one is missing, unreadable, of another size than models_info.json says, or another object.
     """
     models = load_models(folder)
     if sorted(models) != list(range(1, len(TLESS_DIAMETERS_MM) + 1)):
-        raise ValueError(f"holds {len(models)} models with ids {min(models)} to {max(models)}; T-LESS has 1 to 30")
+        raise UserError(f"holds {len(models)} models with ids {min(models)} to {max(models)}; T-LESS has 1 to 30")
     for obj_id, expected_mm in enumerate(TLESS_DIAMETERS_MM, start=1):
         model = models[obj_id]
         measured_mm = diameter_mm(model.vertices_mm)
         for what, value_mm in ("the mesh", measured_mm), ("models_info.json", model.diameter_mm):
             if abs(value_mm - expected_mm) > DIAMETER_TOLERANCE_MM:
-                raise ValueError(
+                raise UserError(
                     f"object {obj_id}: diameter {value_mm:.3f} mm by {what}; {expected_mm:.3f} mm is that of T-LESS"
                 )
 
@@ -88,17 +89,17 @@ def check_dtd(folder: Path) -> None:
     """The 47 categories of 120 textures each.
 
     Raises:
-        ValueError: a category or an image is missing, or an image is empty.
+        UserError: a category or an image is missing, or an image is empty.
     """
     images = [path for path in folder.glob("*/*") if path.is_file() and not path.name.startswith(".")]
     counts = Counter(path.parent.name for path in images)
     if len(counts) != DTD_CATEGORIES:
-        raise ValueError(f"holds {len(counts)} categories of textures; DTD has {DTD_CATEGORIES}")
+        raise UserError(f"holds {len(counts)} categories of textures; DTD has {DTD_CATEGORIES}")
     for category, count in sorted(counts.items()):
         if count != DTD_IMAGES_PER_CATEGORY:
-            raise ValueError(f"category {category} has {count} images; in DTD each has {DTD_IMAGES_PER_CATEGORY}")
+            raise UserError(f"category {category} has {count} images; in DTD each has {DTD_IMAGES_PER_CATEGORY}")
     if empty := [path for path in images if path.stat().st_size == 0]:
-        raise ValueError(f"{len(empty)} images are empty, {empty[0].parent.name}/{empty[0].name} for one")
+        raise UserError(f"{len(empty)} images are empty, {empty[0].parent.name}/{empty[0].name} for one")
 
 
 TLESS = DataSource(

@@ -25,8 +25,8 @@ from typing import Literal
 
 import numpy as np
 
-from generator.symmetry.point_groups import FIVE_FOLD_AXIS, THREE_FOLD_AXIS, Family, GroupName, X, Z
-from generator.symmetry.quaternions import IDENTITY, Floats, from_axis_angle, multiply, normalise
+from synthetless.symmetry.point_groups import FIVE_FOLD_AXIS, THREE_FOLD_AXIS, Family, GroupName, X, Z
+from synthetless.symmetry.quaternions import IDENTITY, Floats, from_axis_angle, multiply, normalise
 
 Scheme = Literal["pitteri2019", "atlas"]
 

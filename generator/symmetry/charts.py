@@ -19,8 +19,8 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from generator.symmetry.atlas import NO_JUMP_DEG
-from generator.symmetry.quaternions import Floats, conjugate, minimal, multiply, normalise, rotate
+from synthetless.symmetry.atlas import NO_JUMP_DEG
+from synthetless.symmetry.quaternions import Floats, conjugate, minimal, multiply, normalise, rotate
 
 Rule = Literal["nearest", "hemisphere", "margin"]
 Indices = NDArray[np.int64]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from generator.symmetry.point_groups import Z
-from generator.symmetry.quaternions import Floats, from_matrix, minimal, normalise
+from synthetless.symmetry.point_groups import Z
+from synthetless.symmetry.quaternions import Floats, from_matrix, minimal, normalise
 
 
 def signed_axis(axis: Floats) -> Floats:

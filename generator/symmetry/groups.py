@@ -16,10 +16,11 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from generator.symmetry.bop import recognise
-from generator.symmetry.frames import frame_of_axes, frame_of_axis, signed_axis
-from generator.symmetry.point_groups import Family, GroupName, X, Z, parse_name, standard_elements
-from generator.symmetry.quaternions import (
+from synthetless.errors import UserError
+from synthetless.symmetry.frames import frame_of_axes, frame_of_axis, signed_axis
+from synthetless.symmetry.from_bop import recognise
+from synthetless.symmetry.point_groups import Family, GroupName, X, Z, parse_name, standard_elements
+from synthetless.symmetry.quaternions import (
     IDENTITY,
     Floats,
     angle_deg,
@@ -53,7 +54,7 @@ class SymmetryGroup:
         offset_mm: a point that every element fixes, the one nearest to the origin.
 
     Raises:
-        ValueError: an unknown name, a zero or missing axis, axes that are not perpendicular, numbers that are not
+        UserError: an unknown name, a zero or missing axis, axes that are not perpendicular, numbers that are not
             finite.
     """
 
@@ -97,7 +98,7 @@ class SymmetryGroup:
         """
         if frame is not None:
             if axis is not None or secondary_axis is not None:
-                raise ValueError(f"{name}: give either a frame or axes, not both")
+                raise UserError(f"{name}: give either a frame or axes, not both")
             columns = to_matrix(from_matrix(_matrix(frame, f"{name}: frame")[None], name=lambda _: f"{name}: frame")[0])
             family, n = parse_name(name)
             has_axis = family != "SO(3)" and (family, n) != ("C", 1)
@@ -117,7 +118,7 @@ class SymmetryGroup:
         Its frame is the one nearest to the model frame, whatever generators the file lists, in whatever order.
 
         Raises:
-            ValueError: a reflection or another non-rotation, numbers that are not finite, a zero axis, more than 120
+            UserError: a reflection or another non-rotation, numbers that are not finite, a zero axis, more than 120
                 elements, or motions without a common fixed point.
         """
         name, frame, offset = recognise(info)
@@ -174,10 +175,10 @@ class SymmetryGroup:
         """All elements (order, 4) as unit quaternions in the model frame, the identity first.
 
         Raises:
-            ValueError: the group is continuous; see `sampled_wxyz`.
+            UserError: the group is continuous; see `sampled_wxyz`.
         """
         if not self.is_finite:
-            raise ValueError(f"{self.name} has infinitely many elements: use sampled_wxyz")
+            raise UserError(f"{self.name} has infinitely many elements: use sampled_wxyz")
         return self._discrete_wxyz
 
     def sampled_wxyz(self, samples: int = 72) -> Floats:
@@ -231,19 +232,19 @@ def _settled_axes(
     """Unit axes, perpendicular where there are two, defaults filled in; exact ones stay as they are, bit for bit."""
     if parsed == GroupName("C", 1) or parsed.family == "SO(3)":
         if axis is not None or secondary is not None:
-            raise ValueError(f"{name} has no axis of its own: leave axis and secondary_axis out")
+            raise UserError(f"{name} has no axis of its own: leave axis and secondary_axis out")
         return None, None
     if parsed.family in _WITH_TWO_AXES:
         if axis is None and secondary is None:
             return Z, X
         if axis is None or secondary is None:
-            raise ValueError(f"{name} needs both axis and secondary_axis (for D_n a 2-fold axis), or neither")
+            raise UserError(f"{name} needs both axis and secondary_axis (for D_n a 2-fold axis), or neither")
         z, x = _unit(axis, f"{name}: axis"), _unit(secondary, f"{name}: secondary_axis")
         if abs(z @ x) > np.sin(np.radians(1)):
-            raise ValueError(f"{name}: axis {_tuple(z)} and secondary_axis {_tuple(x)} must be perpendicular")
+            raise UserError(f"{name}: axis {_tuple(z)} and secondary_axis {_tuple(x)} must be perpendicular")
         return z, x if abs(z @ x) < 1e-14 else normalise(x - (x @ z) * z)
     if secondary is not None:
-        raise ValueError(f"{name} has one axis: leave secondary_axis out")
+        raise UserError(f"{name} has one axis: leave secondary_axis out")
     return signed_axis(Z if axis is None else _unit(axis, f"{name}: axis")), None
 
 
@@ -251,7 +252,7 @@ def _unit(value: ArrayLike, what: str) -> Floats:
     vector = _vector(value, what)
     length = float(np.linalg.norm(vector))
     if length < 1e-9:
-        raise ValueError(f"{what} is zero: it needs a direction, such as [0, 0, 1]")
+        raise UserError(f"{what} is zero: it needs a direction, such as [0, 0, 1]")
     return vector if abs(length - 1) < 1e-14 else vector / length
 
 
@@ -269,7 +270,7 @@ def _array(value: ArrayLike, shape: tuple[int, ...], what: str) -> Floats:
     except (TypeError, ValueError):
         array = np.empty(0)
     if array.size != math.prod(shape) or not np.isfinite(array).all():
-        raise ValueError(f"{what} is {value!r}, not {math.prod(shape)} finite numbers")
+        raise UserError(f"{what} is {value!r}, not {math.prod(shape)} finite numbers")
     return array.reshape(shape)
 
 

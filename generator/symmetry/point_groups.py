@@ -12,7 +12,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from generator.symmetry.quaternions import IDENTITY, Floats, from_axis_angle, multiply
+from synthetless.errors import UserError
+from synthetless.symmetry.quaternions import IDENTITY, Floats, from_axis_angle, multiply
 
 Family = Literal["C", "D", "T", "O", "I", "SO(2)", "O(2)", "SO(3)"]
 
@@ -33,7 +34,7 @@ def parse_name(name: object) -> GroupName:
     """The family and order of `C1`, `C2` ..., `D2` ..., `T`, `O`, `I`, `SO(2)`, `O(2)`, `SO(3)`.
 
     Raises:
-        ValueError: any other name, an order of 0, or more than 120 elements.
+        UserError: any other name, an order of 0, or more than 120 elements.
     """
     text = str(name)
     match text:
@@ -41,18 +42,18 @@ def parse_name(name: object) -> GroupName:
             return GroupName(text, 0)
     matched = re.fullmatch(r"([CD])(\d{1,6})", text)
     if matched is None:
-        raise ValueError(f"unknown symmetry group {text!r}: did you mean {_nearest_name(text)!r}?")
+        raise UserError(f"unknown symmetry group {text!r}: did you mean {_nearest_name(text)!r}?")
     n = int(matched[2])
     if n == 0:
-        raise ValueError(f"symmetry group {text!r} has order 0: the smallest group is 'C1', no symmetry")
+        raise UserError(f"symmetry group {text!r} has order 0: the smallest group is 'C1', no symmetry")
     if matched[1] == "C":
         if n > MAX_ORDER:
-            raise ValueError(f"symmetry group {text!r} has {n} elements, at most {MAX_ORDER} are allowed: use 'SO(2)'")
+            raise UserError(f"symmetry group {text!r} has {n} elements, at most {MAX_ORDER} are allowed: use 'SO(2)'")
         return GroupName("C", n)
     if n == 1:
-        raise ValueError("symmetry group 'D1' is 'C2' about its 2-fold axis: write 'C2' with that axis")
+        raise UserError("symmetry group 'D1' is 'C2' about its 2-fold axis: write 'C2' with that axis")
     if 2 * n > MAX_ORDER:
-        raise ValueError(f"symmetry group {text!r} has {2 * n} elements, at most {MAX_ORDER} are allowed: use 'O(2)'")
+        raise UserError(f"symmetry group {text!r} has {2 * n} elements, at most {MAX_ORDER} are allowed: use 'O(2)'")
     return GroupName("D", n)
 
 

@@ -12,6 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from synthetless.errors import UserError
+
 Floats = NDArray[np.float64]
 
 IDENTITY: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
@@ -92,7 +94,7 @@ def from_matrix(R: ArrayLike, name: Callable[[int], str] = "rotation {}".format)
     best axis find it to second order in the error.
 
     Raises:
-        ValueError: a matrix with NaN, a reflection, or one farther than `MAX_DEFECT` from any rotation; `name` says
+        UserError: a matrix with NaN, a reflection, or one farther than `MAX_DEFECT` from any rotation; `name` says
             how to call number i.
     """
     matrices = np.asarray(R, dtype=np.float64)
@@ -110,7 +112,7 @@ def from_matrix(R: ArrayLike, name: Callable[[int], str] = "rotation {}".format)
     bad = ~(defect <= MAX_DEFECT**2)
     if bad.any():
         i = int(np.argmax(bad))
-        raise ValueError(f"{name(i)} is no rotation: {_what_is_wrong(flat[i].reshape(3, 3))}")
+        raise UserError(f"{name(i)} is no rotation: {_what_is_wrong(flat[i].reshape(3, 3))}")
     return np.asarray(q)
 
 

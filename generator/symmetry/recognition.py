@@ -10,9 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from generator.symmetry.frames import frame_of_axes, frame_of_axis
-from generator.symmetry.point_groups import MAX_ORDER, Family, GroupName, Z, standard_elements
-from generator.symmetry.quaternions import (
+from synthetless.errors import UserError
+from synthetless.symmetry.frames import frame_of_axes, frame_of_axis
+from synthetless.symmetry.point_groups import MAX_ORDER, Family, GroupName, Z, standard_elements
+from synthetless.symmetry.quaternions import (
     IDENTITY,
     Floats,
     angle_deg,
@@ -34,7 +35,7 @@ def recognise_finite(rotations: Sequence[Floats]) -> tuple[GroupName, Floats]:
     Of the frames that describe the same group the one nearest to the identity is taken.
 
     Raises:
-        ValueError: they generate more than 120 elements, or are too inaccurate to tell what they generate.
+        UserError: they generate more than 120 elements, or are too inaccurate to tell what they generate.
     """
     generators = [q for q in (_snapped(q) for q in rotations) if angle_deg(q, np.array(IDENTITY)) > SAME_DEG]
     elements = _closure(generators)
@@ -60,7 +61,7 @@ def _snapped(q: Floats) -> Floats:
     misfit = np.abs(nearest - angle) * n**2
     best = int(np.argmax(misfit <= misfit.min() + 1e-9))
     if misfit[best] > 0.1 or abs(nearest[best] - angle) > 5e-3:
-        raise ValueError(
+        raise UserError(
             f"a rotation by {np.degrees(angle):.4f} degrees generates more than {MAX_ORDER} rotations: "
             "it is no finite symmetry (a full turn divided by a whole number); use a continuous one"
         )
@@ -78,7 +79,7 @@ def _closure(generators: Sequence[Floats]) -> Floats:
             if angle_deg(np.stack(elements), product).min() > SAME_DEG:  # two generators may give the same
                 elements.append(product)
         if len(elements) > MAX_ORDER:
-            raise ValueError(
+            raise UserError(
                 f"symmetries_discrete generate more than {MAX_ORDER} rotations: "
                 "they belong to no finite rotation group (axes or angles are wrong, or the part is continuous)"
             )
@@ -111,7 +112,7 @@ def _name_of(size: int, orders: list[int]) -> GroupName:
     for family, expected in candidates.items():
         if orders == expected:
             return GroupName(family, {"C": size, "D": size // 2}.get(family, 0))
-    raise ValueError(
+    raise UserError(
         f"symmetries_discrete generate {size} rotations with axes of orders {orders}: "
         "they are too inaccurate to tell the group"
     )
@@ -140,7 +141,7 @@ def _fitted_frame(name: GroupName, first: Floats, elements: Floats, generators: 
     frame = min(starts, key=lambda start: _misfit_deg(start, ideal, elements))
     frame = _best_rotation(frame, ideal, generators)
     if _misfit_deg(frame, ideal, elements) > FIT_DEG:
-        raise ValueError(
+        raise UserError(
             "symmetries_discrete are too inaccurate to tell the group: write it into a symmetry table instead"
         )
     equal_frames = multiply(frame, standard_elements(_normaliser(name)))

@@ -27,10 +27,11 @@ from typing import Any, Self
 import numpy as np
 import yaml
 
-from generator.formats.files import atomic_write, read_bytes
-from generator.symmetry.atlas import SCHEMES, Scheme
-from generator.symmetry.groups import SymmetryGroup
-from generator.symmetry.mapping import CanonicalMap
+from synthetless.errors import UserError
+from synthetless.io.files import atomic_write, read_bytes
+from synthetless.symmetry.atlas import SCHEMES, Scheme
+from synthetless.symmetry.canonical import CanonicalMap
+from synthetless.symmetry.groups import SymmetryGroup
 
 Matrix = tuple[tuple[float, ...], ...]
 
@@ -85,7 +86,7 @@ class SymmetryTable:
         """The table of the groups that BOP's `models_info.json` declares (keys: object ids as int or str).
 
         Raises:
-            ValueError: an entry that describes no rotation group, with the object's id.
+            UserError: an entry that describes no rotation group, with the object's id.
         """
         entries = {}
         for key, info in models_info.items():
@@ -93,7 +94,7 @@ class SymmetryTable:
             try:
                 entries[obj_id] = SymmetryEntry(SymmetryGroup.from_bop(info))
             except ValueError as error:
-                raise ValueError(f"object {obj_id}: {error}") from error
+                raise UserError(f"object {obj_id}: {error}") from error
         return cls(entries, scheme, allocentric)
 
     @classmethod
@@ -102,31 +103,31 @@ class SymmetryTable:
         `models_info.json`.
 
         Raises:
-            ValueError: unknown keys or groups (with the nearest known name), or values that describe no rotation
+            UserError: unknown keys or groups (with the nearest known name), or values that describe no rotation
                 group.
         """
         if not isinstance(data, Mapping):
-            raise ValueError(
+            raise UserError(
                 "a symmetry table is a mapping of objects, such as 'object 26: {group: C2, axis: [0, 0, 1]}'"
             )
         objects = data.get("objects", {key: value for key, value in data.items() if key not in _TABLE_KEYS})
         if "objects" in data:
             _refuse_unknown(data, _TABLE_KEYS, "the symmetry table")
         if not isinstance(objects, Mapping):
-            raise ValueError(f"objects is {objects!r}, not a mapping of object ids to groups")
+            raise UserError(f"objects is {objects!r}, not a mapping of object ids to groups")
         scheme, allocentric = data.get("scheme", SCHEMES[0]), data.get("allocentric", False)
         _check_scheme(scheme)
         if not isinstance(allocentric, bool):
-            raise ValueError(f"allocentric is {allocentric!r}, not true or false")
+            raise UserError(f"allocentric is {allocentric!r}, not true or false")
         entries: dict[int, SymmetryEntry] = {}
         for key, value in objects.items():
             obj_id = _object_id(key)
             if obj_id in entries:
-                raise ValueError(f"object {obj_id} is listed twice")
+                raise UserError(f"object {obj_id} is listed twice")
             try:
                 entries[obj_id] = _entry(value, scheme)
             except ValueError as error:
-                raise ValueError(f"object {obj_id}: {error}") from error
+                raise UserError(f"object {obj_id}: {error}") from error
         return cls(entries, scheme, allocentric)
 
     @classmethod
@@ -134,20 +135,20 @@ class SymmetryTable:
         """The table in a YAML or JSON file.
 
         Raises:
-            ValueError: the file cannot be read, is neither JSON nor YAML, or what `from_dict` refuses; with the file's
+            UserError: the file cannot be read, is neither JSON nor YAML, or what `from_dict` refuses; with the file's
                 name.
         """
         data = read_bytes(Path(path))
         try:
             return cls.from_dict(_parsed(data.decode()))
         except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
+            raise UserError(f"{path}: {error}") from error
 
     def write(self, path: str | Path) -> None:
         """Write the table as JSON (which is YAML as well), always the same bytes, whole or not at all.
 
         Raises:
-            ValueError: the file cannot be written.
+            UserError: the file cannot be written.
         """
         head = [f'"scheme": {json.dumps(self.scheme)}', f'"allocentric": {json.dumps(self.allocentric)}']
         lines = [f"  {json.dumps(key)}: {json.dumps(entry)}" for key, entry in self.to_dict()["objects"].items()]
@@ -167,10 +168,10 @@ class SymmetryTable:
         """The map that labels an object's poses.
 
         Raises:
-            ValueError: the table does not have the object.
+            UserError: the table does not have the object.
         """
         if obj_id not in self.entries:
-            raise ValueError(f"object {obj_id} is not in the symmetry table, which has {_listed(self.entries)}")
+            raise UserError(f"object {obj_id} is not in the symmetry table, which has {_listed(self.entries)}")
         return self.entries[obj_id].canonical_map(self.scheme, self.allocentric, decimals)
 
     def _described(self, entry: SymmetryEntry) -> dict[str, Any]:
@@ -199,14 +200,14 @@ def _entry(value: object, scheme: Scheme) -> SymmetryEntry:
     if isinstance(value, str):
         return SymmetryEntry(SymmetryGroup.from_name(value))
     if not isinstance(value, Mapping):
-        raise ValueError(f"{value!r} describes no symmetries; write for example {{group: C2, axis: [0, 0, 1]}}")
+        raise UserError(f"{value!r} describes no symmetries; write for example {{group: C2, axis: [0, 0, 1]}}")
     if value and value.keys() <= set(_BOP_KEYS):
         return SymmetryEntry(SymmetryGroup.from_bop(value))
     _refuse_unknown(value, _GIVEN_KEYS + _DERIVED_KEYS, "it")
     if "group" not in value:
-        raise ValueError("it has no group; write for example {group: C2, axis: [0, 0, 1]}")
+        raise UserError("it has no group; write for example {group: C2, axis: [0, 0, 1]}")
     if "offset" in value and "offset_mm" in value:
-        raise ValueError("offset and offset_mm are the same thing: give one of them")
+        raise UserError("offset and offset_mm are the same thing: give one of them")
     offset = value.get("offset_mm", value.get("offset"))
     group = SymmetryGroup.from_name(
         value["group"],
@@ -228,7 +229,7 @@ def _reference(value: object) -> Matrix | None:
     except (TypeError, ValueError):
         matrix = np.empty(0)
     if matrix.size != 9:
-        raise ValueError(f"reference_rotation is {value!r}, not 3 rows of 3 numbers")
+        raise UserError(f"reference_rotation is {value!r}, not 3 rows of 3 numbers")
     rows = matrix.reshape(3, 3)
     CanonicalMap(SymmetryGroup.trivial(), reference_rotation=rows)  # refuses what is no rotation
     return tuple(tuple(float(number) for number in row) for row in rows)
@@ -238,7 +239,7 @@ def _check_derived(given: Mapping[Any, Any], expected: Mapping[str, Any]) -> Non
     """A file whose group was edited must not keep saying what followed from the former one."""
     for key in _DERIVED_KEYS:
         if key in given and not _agree(given[key], expected[key]):
-            raise ValueError(f"{key} does not follow from the group and scheme: leave {', '.join(_DERIVED_KEYS)} out")
+            raise UserError(f"{key} does not follow from the group and scheme: leave {', '.join(_DERIVED_KEYS)} out")
 
 
 def _agree(a: object, b: object) -> bool:
@@ -254,14 +255,14 @@ def _agree(a: object, b: object) -> bool:
 def _object_id(key: object) -> int:
     matched = _OBJECT_KEY.fullmatch(str(key).strip())
     if matched is None:
-        raise ValueError(f"{key!r} names no object: write 'object 26' or 26{_suggestion(str(key), _TABLE_KEYS)}")
+        raise UserError(f"{key!r} names no object: write 'object 26' or 26{_suggestion(str(key), _TABLE_KEYS)}")
     return int(matched[1])
 
 
 def _refuse_unknown(mapping: Mapping[Any, Any], known: Iterable[str], where: str) -> None:
     for key in mapping:
         if key not in known:
-            raise ValueError(f"{where} has the unknown key {str(key)!r}{_suggestion(str(key), known)}")
+            raise UserError(f"{where} has the unknown key {str(key)!r}{_suggestion(str(key), known)}")
 
 
 def _suggestion(word: str, known: Iterable[str]) -> str:
@@ -271,7 +272,7 @@ def _suggestion(word: str, known: Iterable[str]) -> str:
 
 def _check_scheme(scheme: object) -> None:
     if scheme not in SCHEMES:
-        raise ValueError(f"unknown scheme {scheme!r}: use one of {', '.join(SCHEMES)}")
+        raise UserError(f"unknown scheme {scheme!r}: use one of {', '.join(SCHEMES)}")
 
 
 def _listed(ids: Iterable[int]) -> str:
@@ -286,7 +287,7 @@ def _parsed(text: str) -> object:
     try:
         return yaml.load(text, Loader=_UniqueKeyLoader)
     except yaml.YAMLError as error:
-        raise ValueError(f"neither JSON nor YAML ({' '.join(str(error).split())})") from error
+        raise UserError(f"neither JSON nor YAML ({' '.join(str(error).split())})") from error
 
 
 def _unique(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
@@ -297,7 +298,7 @@ def _unique(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
 def _refuse_repetition(keys: list[Any]) -> None:
     for key in keys:
         if keys.count(key) > 1:
-            raise ValueError(f"{str(key)!r} is listed twice")
+            raise UserError(f"{str(key)!r} is listed twice")
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):

@@ -1,6 +1,6 @@
 """What covers the table: built-in procedural textures, or photographs from a folder. Nothing here needs Blender."""
 
-from scenes.textures.description import (
+from synthetless.scenes.textures.description import (
     PhotoTexture,
     ProceduralTexture,
     Texture,
@@ -8,8 +8,8 @@ from scenes.textures.description import (
     sample_texture,
     texture_from_json,
 )
-from scenes.textures.families import FAMILIES
-from scenes.textures.photos import list_photos, load_photo
+from synthetless.scenes.textures.families import FAMILIES
+from synthetless.scenes.textures.photos import list_photos, load_photo
 
 __all__ = [
     "FAMILIES",

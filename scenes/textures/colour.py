@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scenes.textures.noise import Field
+from synthetless.scenes.textures.noise import Field
 
 Image = NDArray[np.float32]  # (size, size, 3)
 Colours = NDArray[np.float32]  # (n, 3)

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.textures import masonry, materials, prints, textiles
-from scenes.textures.colour import LUMA, Image
+from synthetless.scenes.textures import masonry, materials, prints, textiles
+from synthetless.scenes.textures.colour import LUMA, Image
 
 Painter = Callable[[np.random.Generator, int], Image]
 

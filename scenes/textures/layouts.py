@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.textures.noise import Field, spectral_noise, warp_labels
+from synthetless.scenes.textures.noise import Field, spectral_noise, warp_labels
 
 Labels = NDArray[np.int32]  # (size, size)
 

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from scenes.textures.colour import Image, from_lch, lit, mix, palette, ramp, tones
-from scenes.textures.layouts import Cells, courses, herringbone, hexagons, shuffled, voronoi
-from scenes.textures.noise import Field, blur, coordinates, normalised, smoothstep, spectral_noise
+from synthetless.scenes.textures.colour import Image, from_lch, lit, mix, palette, ramp, tones
+from synthetless.scenes.textures.layouts import Cells, courses, herringbone, hexagons, shuffled, voronoi
+from synthetless.scenes.textures.noise import Field, blur, coordinates, normalised, smoothstep, spectral_noise
 
 
 def tiles(rng: np.random.Generator, size: int) -> Image:

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from scenes.textures.colour import Colours, Image, from_lch, lit, mix, palette, ramp, tones
-from scenes.textures.layouts import courses, herringbone, shuffled, voronoi
-from scenes.textures.noise import (
+from synthetless.scenes.textures.colour import Colours, Image, from_lch, lit, mix, palette, ramp, tones
+from synthetless.scenes.textures.layouts import courses, herringbone, shuffled, voronoi
+from synthetless.scenes.textures.noise import (
     Field,
     blur,
     coordinates,

@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synthetless.errors import UserError
+
 SUFFIXES = (".jpg", ".jpeg", ".png")
 
 JPEG_START, JPEG_SCAN, JPEG_END = b"\xff\xd8\xff", b"\xff\xda", b"\xff\xd9"
@@ -20,14 +22,14 @@ def list_photos(folder: Path) -> tuple[str, ...]:
     Every image counts, normal and roughness maps too: keep those elsewhere. Hidden files are left out.
 
     Raises:
-        ValueError: the folder is missing or holds no image.
+        UserError: the folder is missing or holds no image.
     """
     if not folder.is_dir():
-        raise ValueError(f"textures folder {folder}: not a folder; give one with .jpg or .png photographs")
+        raise UserError(f"textures folder {folder}: not a folder; give one with .jpg or .png photographs")
     found = (path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     names = sorted(p.as_posix() for p in found if not any(part.startswith(".") for part in p.parts))
     if not names:
-        raise ValueError(f"textures folder {folder}: no {', '.join(SUFFIXES)} file in it or below")
+        raise UserError(f"textures folder {folder}: no {', '.join(SUFFIXES)} file in it or below")
     return tuple(names)
 
 
@@ -37,21 +39,21 @@ def load_photo(folder: Path, file: str, max_size_px: int = 2048) -> NDArray[np.u
     16-bit images are reduced to 8 bits, grey ones become RGB, alpha is dropped.
 
     Raises:
-        ValueError: the file cannot be read, is cut short, or is no image.
+        UserError: the file cannot be read, is cut short, or is no image.
     """
     path = folder / file
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise ValueError(f"texture {path}: cannot be read ({error.strerror})") from error
+        raise UserError(f"texture {path}: cannot be read ({error.strerror})") from error
     if _cut_short(data):
-        raise ValueError(f"texture {path}: cut short after {len(data)} bytes; replace or remove it")
+        raise UserError(f"texture {path}: cut short after {len(data)} bytes; replace or remove it")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     except cv2.error:
         image = None
     if image is None:
-        raise ValueError(f"texture {path}: cannot be decoded as an image; replace or remove it")
+        raise UserError(f"texture {path}: cannot be decoded as an image; replace or remove it")
     return _limited(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8), max_size_px)
 
 

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.textures.colour import Colours, Image, mix, palette, ramp
-from scenes.textures.noise import blur, coordinates, normalised, smoothstep, spectral_noise
+from synthetless.scenes.textures.colour import Colours, Image, mix, palette, ramp
+from synthetless.scenes.textures.noise import blur, coordinates, normalised, smoothstep, spectral_noise
 
 Canvas = NDArray[np.uint8]  # (size + 2 BLEED_PX, size + 2 BLEED_PX, 3)
 

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from scenes.textures.colour import Colours, Image, lit, palette
-from scenes.textures.layouts import voronoi
-from scenes.textures.noise import blur, coordinates, spectral_noise
-from scenes.textures.prints import camouflage, checks, clouds, contours, stripes
+from synthetless.scenes.textures.colour import Colours, Image, lit, palette
+from synthetless.scenes.textures.layouts import voronoi
+from synthetless.scenes.textures.noise import blur, coordinates, spectral_noise
+from synthetless.scenes.textures.prints import camouflage, checks, clouds, contours, stripes
 
 
 def woven_fabric(rng: np.random.Generator, size: int) -> Image:

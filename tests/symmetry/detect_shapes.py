@@ -9,8 +9,8 @@ import numpy as np
 import trimesh
 from manifold3d import CrossSection, Manifold
 
-from generator.symmetry import SymmetryGroup
-from generator.symmetry.quaternions import Floats, angle_deg, normalise, to_matrix
+from synthetless.symmetry import SymmetryGroup
+from synthetless.symmetry.quaternions import Floats, angle_deg, normalise, to_matrix
 
 
 def of(solid: Manifold) -> trimesh.Trimesh:

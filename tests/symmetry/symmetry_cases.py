@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
-from generator.symmetry import SymmetryGroup
-from generator.symmetry.quaternions import Floats, from_axis_angle, multiply, normalise, to_matrix
+from synthetless.symmetry import SymmetryGroup
+from synthetless.symmetry.quaternions import Floats, from_axis_angle, multiply, normalise, to_matrix
 
 CYCLIC = ["C2", "C3", "C4", "C5", "C6", "C12"]
 DIHEDRAL = ["D2", "D3", "D4", "D5", "D6"]

@@ -8,8 +8,8 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from generator.symmetry.detection.distance import Surface
-from generator.symmetry.quaternions import Floats
+from synthetless.symmetry.detection.distance import Surface
+from synthetless.symmetry.quaternions import Floats
 
 
 def plain_distances(corners: Floats, points: Floats) -> Floats:

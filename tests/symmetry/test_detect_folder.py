@@ -10,11 +10,11 @@ import pytest
 import trimesh
 from detect_shapes import box, cone, l_bracket
 
-from generator.formats.files import read_json
-from generator.models import load_models
-from generator.symmetry import SymmetryGroup, SymmetryTable
-from generator.symmetry.detection import DetectedFolder, detect_folder, report
-from generator.symmetry.detection.meshes import find_meshes, read_mesh
+from synthetless.io.files import read_json
+from synthetless.io.models import load_models
+from synthetless.symmetry import SymmetryGroup, SymmetryTable
+from synthetless.symmetry.detection import DetectedFolder, detect_folder, report
+from synthetless.symmetry.detection.meshes import find_meshes, read_mesh
 
 L_BRACKET = SymmetryGroup.from_name("C2", axis=(1, 0, 1), offset_mm=(0, 10, 0))
 

@@ -11,9 +11,9 @@ from detect_shapes import KNOWN, apart_deg, as_stl, chiral_gear, moved, noisy, n
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
-from generator.models import read_models_info
-from generator.symmetry import SymmetryGroup
-from generator.symmetry.detection import Detected, detect
+from synthetless.io.models import read_models_info
+from synthetless.symmetry import SymmetryGroup
+from synthetless.symmetry.detection import Detected, detect
 
 PARTS = [18, 26, 33, 34, 35, 36]
 

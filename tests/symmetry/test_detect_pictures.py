@@ -10,12 +10,12 @@ import pytest
 from detect_shapes import box, prism
 from numpy.typing import NDArray
 
-from generator.symmetry import SymmetryGroup, SymmetryTable
-from generator.symmetry.detection.detect import measure
-from generator.symmetry.detection.gallery import draw_table
-from generator.symmetry.detection.meshes import Mesh
-from generator.symmetry.detection.pictures import picture
-from generator.symmetry.table import SymmetryEntry
+from synthetless.symmetry import SymmetryGroup, SymmetryTable
+from synthetless.symmetry.detection.detect import measure
+from synthetless.symmetry.detection.gallery import draw_table
+from synthetless.symmetry.detection.meshes import Mesh
+from synthetless.symmetry.detection.pictures import picture
+from synthetless.symmetry.table import SymmetryEntry
 
 VIEWS_PX, HEAD_PX = 1200, 34
 

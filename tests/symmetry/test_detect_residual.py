@@ -8,9 +8,9 @@ import trimesh
 from detect_shapes import as_stl, box, moved, notched_cylinder, of, prism
 from manifold3d import Manifold
 
-from generator.symmetry import SymmetryGroup
-from generator.symmetry.detection import Residual
-from generator.symmetry.detection.detect import measure
+from synthetless.symmetry import SymmetryGroup
+from synthetless.symmetry.detection import Residual
+from synthetless.symmetry.detection.detect import measure
 
 DEEP, WIDE = 12.0, 3.0
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from symmetry_cases import random_rotations
 
-from generator.symmetry import CanonicalMap, SymmetryGroup, SymmetryTable
-from generator.symmetry.detection.show import DANGEROUS_DEG, dangerous_views, describe, direction_text, read_table
-from generator.symmetry.table import SymmetryEntry
+from synthetless.symmetry import CanonicalMap, SymmetryGroup, SymmetryTable
+from synthetless.symmetry.detection.show import DANGEROUS_DEG, dangerous_views, describe, direction_text, read_table
+from synthetless.symmetry.table import SymmetryEntry
 
 UPRIGHT_FROM_THE_SIDE = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
 

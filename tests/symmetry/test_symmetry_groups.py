@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from symmetry_cases import ALL, CONTINUOUS, FINITE, ORDERS, in_random_frame, random_rotations, seeds
 
-from generator.symmetry import SymmetryGroup
-from generator.symmetry.quaternions import Floats, angle_deg, from_axis_angle, from_matrix, multiply, to_matrix
+from synthetless.symmetry import SymmetryGroup
+from synthetless.symmetry.quaternions import Floats, angle_deg, from_axis_angle, from_matrix, multiply, to_matrix
 
 TLESS_CYLINDERS = {1, 2, 3, 4, 13, 14, 15, 16, 17, 24, 30}
 TLESS_TRIVIAL = {18, 21, 22}

@@ -22,8 +22,8 @@ from symmetry_cases import (
     symmetric_vertices,
 )
 
-from generator.symmetry import CanonicalMap, CanonicalPoses, SymmetryGroup
-from generator.symmetry.quaternions import Floats, angle_deg, from_axis_angle, from_matrix, to_matrix
+from synthetless.symmetry import CanonicalMap, CanonicalPoses, SymmetryGroup
+from synthetless.symmetry.quaternions import Floats, angle_deg, from_axis_angle, from_matrix, to_matrix
 
 N_REGRESSORS = {
     "pitteri2019": {"C1": 1, "T": 4, "O": 4, "I": 4, "SO(2)": 1, "O(2)": 2, "SO(3)": 1},

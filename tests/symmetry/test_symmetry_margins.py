@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from symmetry_cases import CYCLIC, DIHEDRAL, POLYHEDRAL, SCHEMES, in_random_frame, random_rotations, seeds, some_motions
 
-from generator.symmetry import CanonicalMap, SymmetryGroup
-from generator.symmetry.quaternions import Floats, angle_deg, from_matrix, multiply, normalise, to_matrix
+from synthetless.symmetry import CanonicalMap, SymmetryGroup
+from synthetless.symmetry.quaternions import Floats, angle_deg, from_matrix, multiply, normalise, to_matrix
 
 LISTED_DEG = {"C2": 31.40, "C3": 21.09, "C4": 15.86, "C5": 12.70, "C6": 10.59}
 LISTED_DEG |= {"D2": 41.41, "D3": 26.58, "D4": 20.77, "D5": 17.17, "D6": 13.31}

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from symmetry_cases import ALL, SCHEMES, in_random_frame, random_rotations, seeds
 
-from generator.symmetry import SymmetryEntry, SymmetryGroup, SymmetryTable
+from synthetless.symmetry import SymmetryEntry, SymmetryGroup, SymmetryTable
 
 BY_HAND = """
 object 26: {group: C2, axis: [0, 0, 1], offset: [-7, 0, 0]}

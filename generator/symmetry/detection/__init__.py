@@ -1,9 +1,9 @@
 """Detection of symmetry groups from meshes: see `detect` for the method, `folder` for whole folders."""
 
-from generator.symmetry.detection.detect import Detected, Finding, detect
-from generator.symmetry.detection.folder import DetectedFolder, DetectedObject, detect_folder
-from generator.symmetry.detection.report import report
-from generator.symmetry.detection.residual import Residual
+from synthetless.symmetry.detection.detect import Detected, Finding, detect
+from synthetless.symmetry.detection.folder import DetectedFolder, DetectedObject, detect_folder
+from synthetless.symmetry.detection.report import report
+from synthetless.symmetry.detection.residual import Residual
 
 __all__ = [
     "Detected",

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from generator.symmetry.detection.distance import Surface
-from generator.symmetry.detection.field import DistanceField
-from generator.symmetry.detection.orbits import some_elements
-from generator.symmetry.detection.refine import placed, refined
-from generator.symmetry.frames import frame_of_axis
-from generator.symmetry.groups import SymmetryGroup
-from generator.symmetry.point_groups import THREE_FOLD_AXIS, X, Y, Z
-from generator.symmetry.quaternions import Floats, conjugate, from_axis_angle, multiply, to_matrix
+from synthetless.symmetry.detection.distance import Surface
+from synthetless.symmetry.detection.field import DistanceField
+from synthetless.symmetry.detection.orbits import some_elements
+from synthetless.symmetry.detection.refine import placed, refined
+from synthetless.symmetry.frames import frame_of_axis
+from synthetless.symmetry.groups import SymmetryGroup
+from synthetless.symmetry.point_groups import THREE_FOLD_AXIS, X, Y, Z
+from synthetless.symmetry.quaternions import Floats, conjugate, from_axis_angle, multiply, to_matrix
 
 MAX_FOLD = 60
 """The largest order of an axis that is told from a continuous one."""

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from generator.symmetry.detection.candidates import Candidate, CandidateSearch, same
-from generator.symmetry.detection.distance import PIECE, Surface
-from generator.symmetry.detection.refine import refined, simplified
-from generator.symmetry.detection.residual import Meter, Residual
-from generator.symmetry.groups import SymmetryGroup
-from generator.symmetry.quaternions import Floats
+from synthetless.symmetry.detection.candidates import Candidate, CandidateSearch, same
+from synthetless.symmetry.detection.distance import PIECE, Surface
+from synthetless.symmetry.detection.refine import refined, simplified
+from synthetless.symmetry.detection.residual import Meter, Residual
+from synthetless.symmetry.groups import SymmetryGroup
+from synthetless.symmetry.quaternions import Floats
 
 _REFINED_POINTS = 300
 _MOST_REFINED = 40
@@ -100,7 +100,7 @@ def detect(
         declared: a group whose residual is wanted, as it stands.
 
     Raises:
-        ValueError: no triangle has an area.
+        UserError: no triangle has an area.
     """
     surface = Surface(vertices_mm, faces, PIECE * diameter_mm)
     meter = Meter(surface, vertices_mm, diameter_mm)

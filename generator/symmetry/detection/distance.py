@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from generator.symmetry.quaternions import Floats, normalise
+from synthetless.errors import UserError
+from synthetless.symmetry.quaternions import Floats, normalise
 
 Indices = NDArray[np.int64]
 
@@ -45,7 +46,7 @@ class Surface:
         """Take vertices (V, 3) and faces (F, 3).
 
         Raises:
-            ValueError: no triangle has an area.
+            UserError: no triangle has an area.
         """
         corners = _longest_edge_first(vertices[faces])
         first, side = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -53,7 +54,7 @@ class Surface:
         doubled = np.linalg.norm(np.cross(first, side), axis=1)
         solid = doubled > _NO_HEIGHT * longest**2
         if not solid.any():
-            raise ValueError(f"none of its {len(faces)} triangles has an area; a surface is needed")
+            raise UserError(f"none of its {len(faces)} triangles has an area; a surface is needed")
         self.corners, self.areas = corners[solid], doubled[solid] / 2
         self.centroid: Floats = self.areas @ self.corners.mean(axis=1) / self.areas.sum()
         self._planar = _planar_form(self.corners)

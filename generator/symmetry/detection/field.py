@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from generator.symmetry.quaternions import Floats
+from synthetless.symmetry.quaternions import Floats
 
 _GRID = 112
 

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from generator.formats.files import atomic_write, read_json, write_json
-from generator.parallel import each
-from generator.symmetry.atlas import SCHEMES, Scheme
-from generator.symmetry.detection.detect import Detected, Finding, detect
-from generator.symmetry.detection.meshes import find_meshes, read_mesh, unit_warning
-from generator.symmetry.groups import SymmetryGroup
-from generator.symmetry.table import SymmetryEntry, SymmetryTable
+from synthetless.errors import UserError
+from synthetless.io.files import atomic_write, read_json, write_json
+from synthetless.io.parallel import each
+from synthetless.symmetry.atlas import SCHEMES, Scheme
+from synthetless.symmetry.detection.detect import Detected, Finding, detect
+from synthetless.symmetry.detection.meshes import find_meshes, read_mesh, unit_warning
+from synthetless.symmetry.groups import SymmetryGroup
+from synthetless.symmetry.table import SymmetryEntry, SymmetryTable
 
 INFO_FILE = "models_info.json"
 
@@ -80,13 +81,13 @@ class DetectedFolder:
         A PLY file that is already there under its name stays as it is.
 
         Raises:
-            ValueError: a file cannot be written, or the folder holds other meshes.
+            UserError: a file cannot be written, or the folder holds other meshes.
         """
         targets = {to / f"obj_{o.obj_id:06d}.ply": o for o in self.objects}
         for target, o in targets.items():
             stays = target.exists() and target.samefile(o.path) and self.scale == 1
             if not stays and (target.exists() or to.resolve() == self.folder.resolve()):
-                raise ValueError(f"{target}: would stand beside other meshes; give a new folder")
+                raise UserError(f"{target}: would stand beside other meshes; give a new folder")
         for target, o in targets.items():
             if not target.exists():
                 atomic_write(target, self._ply(o))
@@ -118,11 +119,11 @@ def detect_folder(
             ``if __name__ == "__main__"``.
 
     Raises:
-        ValueError: wrong numbers, a folder without meshes, a mesh that is unusable; with the file's name.
+        UserError: wrong numbers, a folder without meshes, a mesh that is unusable; with the file's name.
     """
     for name, value in (("tolerance_percent", tolerance_percent), ("scale", scale)):
         if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"{name} is {value}; a number above 0 is needed")
+            raise UserError(f"{name} is {value}; a number above 0 is needed")
     files = find_meshes(folder)
     declared = _declared(folder)
     tasks = [
@@ -147,7 +148,7 @@ def _detect_file(task: _Task) -> DetectedObject:
     try:
         detected = detect(mesh.vertices_mm, mesh.faces, mesh.diameter_mm, task.tolerance_percent, task.declared)
     except ValueError as error:
-        raise ValueError(f"{task.path}: {error}") from error
+        raise UserError(f"{task.path}: {error}") from error
     return DetectedObject(task.obj_id, task.path, mesh.info(), detected)
 
 
@@ -158,7 +159,7 @@ def _declared(folder: Path) -> dict[int, SymmetryGroup]:
     try:
         table = SymmetryTable.from_models_info(read_json(path))
     except ValueError as error:
-        raise ValueError(f"{path}: {error}" if str(path) not in str(error) else str(error)) from error
+        raise UserError(f"{path}: {error}" if str(path) not in str(error) else str(error)) from error
     return {obj_id: entry.group for obj_id, entry in table.entries.items()}
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from generator.parallel import each
-from generator.symmetry.detection.detect import Finding, measure
-from generator.symmetry.detection.folder import DetectedFolder
-from generator.symmetry.detection.meshes import find_meshes, read_mesh
-from generator.symmetry.detection.pictures import picture, write_picture
-from generator.symmetry.groups import SymmetryGroup
-from generator.symmetry.table import SymmetryTable
+from synthetless.errors import UserError
+from synthetless.io.parallel import each
+from synthetless.symmetry.detection.detect import Finding, measure
+from synthetless.symmetry.detection.folder import DetectedFolder
+from synthetless.symmetry.detection.meshes import find_meshes, read_mesh
+from synthetless.symmetry.detection.pictures import picture, write_picture
+from synthetless.symmetry.groups import SymmetryGroup
+from synthetless.symmetry.table import SymmetryTable
 
 _TOLERANCE_PERCENT = 1.0  # of the diameter: the scale of a table's picture does not end below it
 
@@ -25,7 +26,7 @@ def draw_detected(detected: DetectedFolder, to: Path, workers: int | None = None
         workers: processes; one per available core if None.
 
     Raises:
-        ValueError: a mesh cannot be read any more, or a picture not be written.
+        UserError: a mesh cannot be read any more, or a picture not be written.
     """
     tasks = [
         _Task(
@@ -45,11 +46,11 @@ def draw_table(table: SymmetryTable, models: Path, to: Path, workers: int | None
     """Draw the objects of a symmetry table whose meshes a folder holds; arguments and errors as in `draw_detected`.
 
     Raises:
-        ValueError: the folder holds none of the table's objects.
+        UserError: the folder holds none of the table's objects.
     """
     paths = {obj_id: path for obj_id, path in find_meshes(models).paths.items() if obj_id in table.entries}
     if not paths:
-        raise ValueError(f"{models}: holds none of the table's objects, {', '.join(map(str, table.entries))}")
+        raise UserError(f"{models}: holds none of the table's objects, {', '.join(map(str, table.entries))}")
     tasks = [
         _Task(
             path,

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 
-from generator.symmetry.quaternions import Floats
+from synthetless.errors import UserError
+from synthetless.symmetry.quaternions import Floats
 
 SUFFIXES = (".ply", ".stl", ".obj", ".off")
 
@@ -65,13 +66,13 @@ def find_meshes(folder: Path) -> MeshFiles:
     Ids come from the names (`obj_000012.ply`, `12.stl`) if all of them say one, else from alphabetical order.
 
     Raises:
-        ValueError: no such folder, no mesh in it, or two of one id.
+        UserError: no such folder, no mesh in it, or two of one id.
     """
     if not folder.is_dir():
-        raise ValueError(f"{folder}: no such folder; give one that holds meshes ({', '.join(SUFFIXES)})")
+        raise UserError(f"{folder}: no such folder; give one that holds meshes ({', '.join(SUFFIXES)})")
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
     if not files:
-        raise ValueError(f"{folder}: holds no meshes; files that end in {', '.join(SUFFIXES)} are looked for")
+        raise UserError(f"{folder}: holds no meshes; files that end in {', '.join(SUFFIXES)} are looked for")
     matches = [_ID.fullmatch(path.stem) for path in files]
     if not all(matches):
         return MeshFiles(dict(enumerate(files, start=1)), are_numbered=True)
@@ -79,7 +80,7 @@ def find_meshes(folder: Path) -> MeshFiles:
     for path, match in zip(files, matches, strict=True):
         obj_id = int(match[1]) if match else 0
         if obj_id in paths:
-            raise ValueError(f"{folder}: {paths[obj_id].name} and {path.name} are both object {obj_id}; remove one")
+            raise UserError(f"{folder}: {paths[obj_id].name} and {path.name} are both object {obj_id}; remove one")
         paths[obj_id] = path
     return MeshFiles(dict(sorted(paths.items())), are_numbered=False)
 
@@ -88,15 +89,15 @@ def read_mesh(path: Path, scale: float = 1.0) -> Mesh:
     """Read a mesh; coordinates are multiplied by `scale` to give millimetres.
 
     Raises:
-        ValueError: the file is no mesh, has no faces, coordinates that are not finite, or no extent in some direction.
+        UserError: the file is no mesh, has no faces, coordinates that are not finite, or no extent in some direction.
     """
     vertices, faces = _triangles(path)
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
         bad = int(np.argmin(finite))
-        raise ValueError(f"{path}: vertex {bad} is {vertices[bad].tolist()}; every coordinate must be finite")
+        raise UserError(f"{path}: vertex {bad} is {vertices[bad].tolist()}; every coordinate must be finite")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError(f"{path}: a face names vertex {int(faces.max())}, but there are only {len(vertices)}")
+        raise UserError(f"{path}: a face names vertex {int(faces.max())}, but there are only {len(vertices)}")
     used, faces = np.unique(faces, return_inverse=True)
     vertices = vertices[used] * scale
     return Mesh(vertices, faces.reshape(-1, 3).astype(np.int64), _diameter(path, vertices))
@@ -119,9 +120,9 @@ def _triangles(path: Path) -> tuple[Floats, NDArray[np.int64]]:
         faces = np.asarray(getattr(mesh, "faces", ()), dtype=np.int64).reshape(-1, 3)
     except Exception as error:  # trimesh raises whatever its parsers stumble over
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise ValueError(f"{path}: not a readable mesh ({reason})") from None
+        raise UserError(f"{path}: not a readable mesh ({reason})") from None
     if len(faces) == 0:
-        raise ValueError(f"{path}: holds no faces; a triangle mesh is needed")
+        raise UserError(f"{path}: holds no faces; a triangle mesh is needed")
     return vertices, faces
 
 
@@ -129,7 +130,7 @@ def _diameter(path: Path, vertices: Floats) -> float:
     """The largest distance of two points of the convex hull."""
     extents = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False, compute_uv=False)
     if not extents[-1] > _FLAT * extents[0]:
-        raise ValueError(f"{path}: all its points lie in one plane; a part with a thickness is needed")
+        raise UserError(f"{path}: all its points lie in one plane; a part with a thickness is needed")
     try:
         hull = vertices[ConvexHull(vertices).vertices]
     except QhullError:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from generator.symmetry.detection.distance import Indices
-from generator.symmetry.groups import SymmetryGroup
-from generator.symmetry.quaternions import (
+from synthetless.symmetry.detection.distance import Indices
+from synthetless.symmetry.groups import SymmetryGroup
+from synthetless.symmetry.quaternions import (
     IDENTITY,
     Floats,
     from_axis_angle,

@@ -12,18 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from generator.annotation import PosedModel
-from generator.formats.files import atomic_write
-from generator.formats.images import encode_png
-from generator.raycast import RayCaster
-from generator.symmetry.detection.detect import Finding
-from generator.symmetry.detection.distance import PIECE, Surface
-from generator.symmetry.detection.meshes import Mesh
-from generator.symmetry.detection.orbits import moved, spread_elements
-from generator.symmetry.detection.report import group_cells
-from generator.symmetry.groups import SymmetryGroup
-from generator.symmetry.quaternions import Floats, normalise
-from scenes.spec import Intrinsics
+from synthetless.annotation.instances import PosedModel
+from synthetless.annotation.raycast import RayCaster
+from synthetless.io.files import atomic_write
+from synthetless.io.images import encode_png
+from synthetless.scenes.spec import Intrinsics
+from synthetless.symmetry.detection.detect import Finding
+from synthetless.symmetry.detection.distance import PIECE, Surface
+from synthetless.symmetry.detection.meshes import Mesh
+from synthetless.symmetry.detection.orbits import moved, spread_elements
+from synthetless.symmetry.detection.report import group_cells
+from synthetless.symmetry.groups import SymmetryGroup
+from synthetless.symmetry.quaternions import Floats, normalise
 
 Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -55,7 +55,7 @@ def write_picture(path: Path, image: Image) -> None:
     """Write a picture as PNG.
 
     Raises:
-        ValueError: the file cannot be written.
+        UserError: the file cannot be written.
     """
     atomic_write(path, encode_png(image))
 

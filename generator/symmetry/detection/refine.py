@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from generator.symmetry.detection.distance import Surface
-from generator.symmetry.detection.orbits import some_elements
-from generator.symmetry.detection.residual import Meter
-from generator.symmetry.groups import SymmetryGroup
-from generator.symmetry.point_groups import parse_name
-from generator.symmetry.quaternions import Floats, from_axis_angle, multiply, normalise, to_matrix
+from synthetless.symmetry.detection.distance import Surface
+from synthetless.symmetry.detection.orbits import some_elements
+from synthetless.symmetry.detection.residual import Meter
+from synthetless.symmetry.groups import SymmetryGroup
+from synthetless.symmetry.point_groups import parse_name
+from synthetless.symmetry.quaternions import Floats, from_axis_angle, multiply, normalise, to_matrix
 
 _ELEMENTS = 6
 _IMAGES = 800  # points times elements that a step looks at

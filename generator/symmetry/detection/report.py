@@ -7,9 +7,9 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from generator.symmetry.detection.detect import Detected, Finding
-from generator.symmetry.detection.folder import DetectedFolder, DetectedObject
-from generator.symmetry.groups import SymmetryGroup
+from synthetless.symmetry.detection.detect import Detected, Finding
+from synthetless.symmetry.detection.folder import DetectedFolder, DetectedObject
+from synthetless.symmetry.groups import SymmetryGroup
 
 NONE = "-"
 WIDTH = 100

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from generator.symmetry.detection.distance import Indices, Surface
-from generator.symmetry.detection.orbits import (
+from synthetless.symmetry.detection.distance import Indices, Surface
+from synthetless.symmetry.detection.orbits import (
     elements_along_orbits,
     moved,
     orbit_coordinates,
@@ -20,8 +20,8 @@ from generator.symmetry.detection.orbits import (
     spread_elements,
     turns_beside,
 )
-from generator.symmetry.groups import SymmetryGroup
-from generator.symmetry.quaternions import Floats, multiply
+from synthetless.symmetry.groups import SymmetryGroup
+from synthetless.symmetry.quaternions import Floats, multiply
 
 _DENSE = 160_000  # points that the maximum is searched among; every 8th takes part from the start
 _STRIDE = 8

@@ -8,14 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from generator.formats.files import read_json
-from generator.symmetry.atlas import SCHEMES, Scheme, smallest_margin_deg
-from generator.symmetry.detection.folder import INFO_FILE
-from generator.symmetry.detection.report import WIDTH, aligned, axis_text, group_cells
-from generator.symmetry.groups import SymmetryGroup
-from generator.symmetry.point_groups import parse_name
-from generator.symmetry.quaternions import Floats, rotate, to_matrix
-from generator.symmetry.table import SymmetryEntry, SymmetryTable
+from synthetless.errors import UserError
+from synthetless.io.files import read_json
+from synthetless.symmetry.atlas import SCHEMES, Scheme, smallest_margin_deg
+from synthetless.symmetry.detection.folder import INFO_FILE
+from synthetless.symmetry.detection.report import WIDTH, aligned, axis_text, group_cells
+from synthetless.symmetry.groups import SymmetryGroup
+from synthetless.symmetry.point_groups import parse_name
+from synthetless.symmetry.quaternions import Floats, rotate, to_matrix
+from synthetless.symmetry.table import SymmetryEntry, SymmetryTable
 
 DANGEROUS_DEG = 5.0
 """A margin below this is called dangerous: a pose estimator's error is of that size."""
@@ -36,12 +37,12 @@ def read_table(path: Path) -> SymmetryTable:
     """The table in a file, or in a folder's `symmetries.json` or `models_info.json`.
 
     Raises:
-        ValueError: there is none, or it is wrong; with the file's name.
+        UserError: there is none, or it is wrong; with the file's name.
     """
     if path.is_dir():
         found = [path / name for name in (_TABLE_FILE, INFO_FILE) if (path / name).exists()]
         if not found:
-            raise ValueError(f"{path}: holds neither {_TABLE_FILE} nor {INFO_FILE}; symmetries detect can write one")
+            raise UserError(f"{path}: holds neither {_TABLE_FILE} nor {INFO_FILE}; symmetries detect can write one")
         path = found[0]
     if path.name != INFO_FILE:
         return SymmetryTable.read(path)
@@ -49,7 +50,7 @@ def read_table(path: Path) -> SymmetryTable:
     try:
         return SymmetryTable.from_models_info(content)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise UserError(f"{path}: {error}") from error
 
 
 def describe(table: SymmetryTable) -> str:

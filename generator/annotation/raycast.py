@@ -1,0 +1,468 @@
+"""Exact geometry of an image without rendering it: depth, instance ids, silhouettes and what of them is visible.
+
+Rays through the pixels' centres, (u, v) = (i, j), are cast at each mesh in its own frame, inside the window that its
+convex hull projects to, beyond the border too: that gives the truncated part of a silhouette. Embree finds the
+triangle, double precision the point on it. The table is intersected in closed form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore import EmbreeDevice
+from embreex.rtcore_scene import EmbreeScene
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from synthetless.annotation.instances import (
+    BACKGROUND,
+    ImageAnnotation,
+    InstanceAnnotation,
+    PosedModel,
+    Window,
+    canvas_window,
+    image_window,
+    measure_instance,
+    visible_within,
+)
+from synthetless.errors import UserError
+from synthetless.scenes.spec import Intrinsics
+
+NEAR_CLIP_MM = 10.0
+"""Nothing closer to the camera plane than this is seen; the rendering camera clips at the same distance."""
+
+MISS = -1
+"""Triangle number of a ray that meets nothing."""
+
+_START_MARGIN_MM = 1.0
+_FAR_OUTSIDE_PX = 1e9
+_NO_HEIGHT = 1e-9
+"""A triangle this flat, as a share of its longest edge, has no normal in double precision, and no ray can hit it."""
+_EDGE_ON = 0.05
+"""Cosine below which an error of Embree's single precision (about 1e-4 mm across the ray) could move z noticeably."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """The viewing rays of a window of pixels, up to z = 1: (x[i], y[j], 1) in the camera frame."""
+
+    window: Window
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+
+    @classmethod
+    def through(cls, camera: Intrinsics, window: Window) -> Rays:
+        """The rays through the pixels' centres, (u, v) = (i, j)."""
+        x = (np.arange(window.left, window.right) - camera.cx) / camera.fx
+        y = (np.arange(window.top, window.bottom) - camera.cy) / camera.fy
+        return cls(window, x, y)
+
+    @property
+    def lengths(self) -> NDArray[np.float64]:
+        """(h, w) distance from the camera to z = 1 along each ray."""
+        lengths: NDArray[np.float64] = np.sqrt(self.x**2 + (self.y**2 + 1.0)[:, None])
+        return lengths
+
+    def in_model_frame(self, R_m2c: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(h, w, 3) all directions."""
+        directions: NDArray[np.float64] = self.x[:, None] * R_m2c[0] + (self.y[:, None] * R_m2c[1] + R_m2c[2])[:, None]
+        return directions
+
+    def at(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float64]:
+        """(N, 3) directions of single pixels, camera frame."""
+        return np.stack([self.x[columns], self.y[rows], np.ones(len(rows))], axis=1)
+
+
+class Surface:
+    """A mesh and its ray-casting tree, built once.
+
+    The mesh is kept relative to the centre of its box, so that single precision is fine wherever its origin is.
+
+    Attributes:
+        center_mm: (3,) centre of the box, model frame.
+        vertices_mm: (V, 3) relative to the centre.
+        faces: (F, 3) the triangles that have an area.
+        normals: (F, 3) unit normals, oriented by the order of the vertices.
+        offsets_mm: (F,) distance of each triangle's plane from the centre, along its normal.
+        hull_mm: (P, 3) points relative to the centre whose convex hull holds the mesh.
+        scene: Embree's tree over ``faces``.
+    """
+
+    def __init__(self, device: EmbreeDevice, vertices_mm: ArrayLike, faces: ArrayLike) -> None:
+        """Build the tree.
+
+        Args:
+            device: Embree's device.
+            vertices_mm: (V, 3), model frame.
+            faces: (F, 3) vertex numbers.
+
+        Raises:
+            UserError: shapes, coordinates or vertex numbers are unusable, or no triangle has an area.
+        """
+        vertices, triangles = _checked(vertices_mm, faces)
+        corners = vertices[triangles]
+        edges = corners - np.roll(corners, 1, axis=1)
+        normals = np.cross(edges[:, 1], edges[:, 2])
+        doubled_areas = np.linalg.norm(normals, axis=1)
+        solid = doubled_areas > _NO_HEIGHT * np.square(edges).sum(axis=2).max(axis=1)
+        if not solid.any():
+            raise UserError(f"none of the mesh's {len(triangles)} triangles has an area; a surface is needed")
+        used = corners[solid].reshape(-1, 3)
+        self.center_mm: NDArray[np.float64] = (used.min(axis=0) + used.max(axis=0)) / 2
+        self.vertices_mm: NDArray[np.float64] = vertices - self.center_mm
+        self.faces: NDArray[np.int32] = triangles[solid]
+        self.normals: NDArray[np.float64] = normals[solid] / doubled_areas[solid, None]
+        self.offsets_mm: NDArray[np.float64] = _dot(self.normals, self.vertices_mm[self.faces[:, 0]])
+        self.hull_mm = _hull_points(np.unique(used, axis=0) - self.center_mm)
+        self.scene = EmbreeScene(device, robust=True)  # robust: no ray slips through between two triangles
+        TriangleMesh(self.scene, self.vertices_mm.astype(np.float32), self.faces)
+
+
+@dataclass(frozen=True, eq=False)
+class PosedSurface:
+    """A surface in front of the camera.
+
+    Attributes:
+        surface: the mesh.
+        R_m2c: (3, 3) rotation, model to camera.
+        t_center: (3,) where the centre of the model's box is, camera frame, millimetres.
+    """
+
+    surface: Surface
+    R_m2c: NDArray[np.float64]
+    t_center: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, surface: Surface, R_m2c: ArrayLike, t_m2c: ArrayLike) -> PosedSurface:
+        """Pose a surface by BOP's R_m2c and t_m2c (mm)."""
+        R = np.asarray(R_m2c, dtype=np.float64)
+        return cls(surface, R, R @ surface.center_mm + np.asarray(t_m2c, dtype=np.float64))
+
+    def window(self, camera: Intrinsics) -> Window:
+        """A window that holds every pixel that can show the mesh; may leave the image, empty if it is behind."""
+        points = self._to_camera(self.surface.hull_mm)
+        if points[:, 2].min() < NEAR_CLIP_MM:
+            points = _clip_to_front(self._to_camera(_box_corners(self.surface.hull_mm)))
+        if len(points) == 0:
+            return Window(0, 0, 0, 0)
+        u = camera.fx * points[:, 0] / points[:, 2] + camera.cx
+        v = camera.fy * points[:, 1] / points[:, 2] + camera.cy
+        bounds = np.clip([u.min(), v.min(), u.max(), v.max()], -_FAR_OUTSIDE_PX, _FAR_OUTSIDE_PX)
+        left, top, right, bottom = (int(bound) for bound in [*np.floor(bounds[:2]), *np.ceil(bounds[2:])])
+        return Window(left, top, right + 1, bottom + 1)
+
+    def first_faces(self, rays: Rays) -> NDArray[np.int32]:
+        """(h, w) the first triangle each ray meets, or MISS."""
+        if 0 in rays.window.shape:
+            return np.full(rays.window.shape, MISS, dtype=np.int32)
+        # Starting just before the mesh instead of at the camera keeps the single-precision distances short.
+        start = max(NEAR_CLIP_MM, float(self._to_camera(self.surface.hull_mm)[:, 2].min()) - _START_MARGIN_MM)
+        directions = rays.in_model_frame(self.R_m2c).reshape(-1, 3)
+        origins = start * directions - self.t_center @ self.R_m2c
+        found: NDArray[np.int32] = self.surface.scene.run(origins.astype(np.float32), directions.astype(np.float32))
+        return found.reshape(rays.window.shape)
+
+    def depth_mm(self, rays: Rays, faces: NDArray[np.int32]) -> NDArray[np.float64]:
+        """(h, w) z where each ray crosses the plane of its triangle, inf where it has none."""
+        rows, columns = pixels_where(faces != MISS)
+        hit = faces[rows, columns]
+        normals = self.normals(hit)
+        slopes = _dot(normals, rays.at(rows, columns))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = (self.surface.offsets_mm.take(hit) + normals @ self.t_center) / slopes
+        # A plane seen nearly edge-on has no well-defined crossing: keep z within the triangle's own range.
+        edge_on = np.flatnonzero(np.abs(slopes) < _EDGE_ON)
+        corner_z = self.surface.vertices_mm[self.surface.faces[hit[edge_on]]] @ self.R_m2c[2] + self.t_center[2]
+        z[edge_on] = np.fmax(np.fmin(z[edge_on], corner_z.max(axis=1)), corner_z.min(axis=1))
+        depth = np.full(faces.shape, np.inf)
+        depth[rows, columns] = z
+        return depth
+
+    def normals(self, faces: NDArray[np.int32]) -> NDArray[np.float64]:
+        """(N, 3) unit normals of triangles, camera frame."""
+        return self.surface.normals.take(faces, axis=0) @ self.R_m2c.T
+
+    def to_model(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N, 3) model coordinates of points in the camera frame."""
+        return (points_mm - self.t_center) @ self.R_m2c + self.surface.center_mm
+
+    def _to_camera(self, centered_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        return centered_mm @ self.R_m2c.T + self.t_center
+
+
+def pixels_where(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns of a 2-D mask's true pixels (numpy's own nonzero takes three times as long)."""
+    return np.divmod(np.flatnonzero(mask), mask.shape[1])
+
+
+def _checked(vertices_mm: ArrayLike, faces: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    vertices, triangles = np.asarray(vertices_mm, dtype=np.float64), np.asarray(faces, dtype=np.int32)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
+        raise UserError(f"vertices of shape {vertices.shape} are unusable; (V, 3) finite numbers are needed")
+    if triangles.ndim != 2 or triangles.shape[1] != 3 or len(triangles) == 0:
+        raise UserError(f"faces of shape {triangles.shape} are unusable; (F, 3) vertex numbers are needed")
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise UserError(
+            f"faces name vertices {triangles.min()} to {triangles.max()}, but the mesh has 0 to {len(vertices) - 1}"
+        )
+    return vertices, triangles
+
+
+def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    product_sum: NDArray[np.float64] = np.einsum("ij,ij->i", a, b)
+    return product_sum
+
+
+def _hull_points(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The points on the convex hull, or the box's corners if the mesh is flat."""
+    try:
+        on_hull: NDArray[np.float64] = points[ConvexHull(points).vertices]
+        return on_hull
+    except QhullError:
+        return _box_corners(points)
+
+
+def _box_corners(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    limits = np.stack([points.min(axis=0), points.max(axis=0)])
+    return np.array(list(product(*limits.T)), dtype=np.float64)
+
+
+def _clip_to_front(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points whose convex hull holds that part of the corners' hull that is in front of the near plane.
+
+    The cut is spanned by the crossings of all segments from a corner in front to one behind; none if all are behind.
+    """
+    in_front = corners[:, 2] >= NEAR_CLIP_MM
+    front, behind = corners[in_front][:, None], corners[~in_front][None]
+    share = (NEAR_CLIP_MM - front[..., 2:]) / (behind[..., 2:] - front[..., 2:])
+    crossings = front + share * (behind - front)
+    return np.concatenate([corners[in_front], crossings.reshape(-1, 3)])
+
+
+_SURELY_MM = 1e-6
+"""More than rounding can move a point on the table."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """The table: the plane z = 0 of the world, or a square of it.
+
+    Attributes:
+        R_w2c: (3, 3) rotation, world to camera (OpenCV), as BOP's cam_R_w2c.
+        t_w2c: (3,) translation, millimetres, as BOP's cam_t_w2c.
+        half_size_mm: the table is |x|, |y| <= half_size_mm of the world; unbounded if None.
+    """
+
+    R_w2c: NDArray[np.float64]
+    t_w2c: NDArray[np.float64]
+    half_size_mm: float | None = None
+
+    @property
+    def normal(self) -> NDArray[np.float64]:
+        """(3,) unit normal that faces the camera, camera frame."""
+        up = self.R_w2c[:, 2]
+        return -up if up @ self.t_w2c > 0 else up
+
+    def depth_mm(self, rays: Rays) -> NDArray[np.float64]:
+        """(h, w) z where each ray meets the table, inf where it does not."""
+        up = self.R_w2c[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z: NDArray[np.float64] = (up @ self.t_w2c) / _along(up, rays.x, rays.y)
+            # What a window shows of the plane is convex, and so is the table: with the corners all of it is there.
+            ends = [0, -1]
+            if z.size and self._is_met(rays.x[ends], rays.y[ends], z[np.ix_(ends, ends)], _SURELY_MM).all():
+                return z
+            return np.where(self._is_met(rays.x, rays.y, z), z, np.inf)
+
+    def _is_met(
+        self, x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64], margin_mm: float = 0.0
+    ) -> NDArray[np.bool_]:
+        """Whether points of the plane, on the rays (x, y, 1) of a grid, are in front of the camera and on the table."""
+        met: NDArray[np.bool_] = np.isfinite(z) & (z >= NEAR_CLIP_MM + margin_mm)
+        if self.half_size_mm is not None:
+            origin = self.t_w2c @ self.R_w2c
+            for axis in (0, 1):
+                distance = np.abs(_along(self.R_w2c[:, axis], x, y) * z - origin[axis])
+                met &= distance <= self.half_size_mm - margin_mm
+        return met
+
+
+@dataclass(frozen=True, eq=False)
+class Occluder:
+    """A mesh that hides what is behind it but has no label.
+
+    Attributes:
+        key: of its mesh.
+        R_m2c: (3, 3) rotation, model to camera.
+        t_m2c: (3,) translation, millimetres.
+    """
+
+    key: Hashable
+    R_m2c: NDArray[np.float64]
+    t_m2c: NDArray[np.float64]
+
+
+class RayCaster:
+    """Casts rays at a set of meshes and keeps the tree of each that was posed.
+
+    It uses one thread. It cannot be pickled, nor used on both sides of a fork: give each process its own.
+    """
+
+    def __init__(self, meshes: Mapping[Any, tuple[ArrayLike, ArrayLike]]) -> None:
+        """Take the meshes; a tree is built when its mesh is first posed.
+
+        Args:
+            meshes: vertices (V, 3) in millimetres, model frame, and faces (F, 3), by key: the BOP id for objects that
+                get labels, anything for occluders.
+        """
+        self._meshes = meshes
+        self._device = EmbreeDevice()
+        self._surfaces: dict[Hashable, Surface] = {}
+
+    def annotate(
+        self,
+        camera: Intrinsics,
+        plane: Plane | None,
+        instances: Sequence[PosedModel],
+        occluders: Sequence[Occluder] = (),
+        visibility_delta_mm: float = 0.0,
+        normals: bool = False,
+        object_coordinates: bool = False,
+    ) -> ImageAnnotation:
+        """Measure one image. Of surfaces at exactly the same depth the first instance is seen, the table last.
+
+        Args:
+            camera: the pinhole.
+            plane: the table, or None.
+            instances: what gets labels; ``obj_id`` is the key of its mesh.
+            occluders: what hides, but gets none.
+            visibility_delta_mm: how far behind the nearest surface a point still counts as visible, along the ray, as
+                bop_toolkit has it. With 0 an instance is visible exactly where it is the nearest surface.
+            normals: also give the normals.
+            object_coordinates: also give the object coordinates.
+
+        Raises:
+            UserError: the tolerance is negative, or a mesh is unknown or unusable.
+        """
+        if not visibility_delta_mm >= 0:
+            raise UserError(f"visibility_delta_mm is {visibility_delta_mm}; a number >= 0 is needed")
+        image, canvas = image_window(camera), canvas_window(camera)
+        hits = [self._cast(camera, posed.obj_id, posed.R_m2c, posed.t_m2c, canvas) for posed in instances]
+        hits += [self._cast(camera, posed.key, posed.R_m2c, posed.t_m2c, image) for posed in occluders]
+        scene = _NearestSurface(camera, hits, plane)
+        return ImageAnnotation(
+            depth_mm=np.where(np.isfinite(scene.depth_mm), scene.depth_mm, 0.0),
+            instance_ids=np.where(scene.owner < len(instances), scene.owner, BACKGROUND),
+            instances=tuple(scene.instance(number, visibility_delta_mm) for number in range(len(instances))),
+            normals=scene.normals() if normals else None,
+            object_coordinates_mm=scene.object_coordinates_mm(len(instances)) if object_coordinates else None,
+        )
+
+    def _cast(self, camera: Intrinsics, key: Hashable, R_m2c: ArrayLike, t_m2c: ArrayLike, limits: Window) -> _Hits:
+        body = PosedSurface.of(self._surface(key), R_m2c, t_m2c)
+        window = limits.intersection(body.window(camera))
+        faces = body.first_faces(Rays.through(camera, window))
+        inside = image_window(camera).intersection(window)
+        rays = Rays.through(camera, inside)
+        faces_inside = faces[inside.slices_in(window)]
+        return _Hits(body, window, faces != MISS, rays, faces_inside, body.depth_mm(rays, faces_inside))
+
+    def _surface(self, key: Hashable) -> Surface:
+        if key not in self._surfaces:
+            if key not in self._meshes:
+                raise UserError(f"no mesh for object {key!r}; there are {', '.join(map(repr, self._meshes))}")
+            try:
+                self._surfaces[key] = Surface(self._device, *self._meshes[key])
+            except ValueError as error:
+                raise UserError(f"object {key!r}: {error}") from None
+        return self._surfaces[key]
+
+
+@dataclass(frozen=True, eq=False)
+class _Hits:
+    """Where one body alone is met by the rays.
+
+    Attributes:
+        body: the posed mesh.
+        window: on the canvas; holds the whole silhouette.
+        silhouette: (h, w) bool over ``window``.
+        rays: those of ``window`` that are inside the image; the other arrays are over them.
+        faces: triangle numbers, or MISS.
+        depth_mm: z, or inf.
+    """
+
+    body: PosedSurface
+    window: Window
+    silhouette: NDArray[np.bool_]
+    rays: Rays
+    faces: NDArray[np.int32]
+    depth_mm: NDArray[np.float64]
+
+
+class _NearestSurface:
+    """The first surface behind every pixel of the image.
+
+    Attributes:
+        depth_mm: (H, W) its z, inf where there is none.
+        owner: (H, W) int32, whose it is: index into the hits, their number for the plane, -1 for nothing.
+    """
+
+    def __init__(self, camera: Intrinsics, hits: Sequence[_Hits], plane: Plane | None) -> None:
+        self._image, self._hits, self._plane = image_window(camera), hits, plane
+        self.depth_mm = np.full(self._image.shape, np.inf)
+        self.owner = np.full(self._image.shape, -1, dtype=np.int32)
+        for number, hit in enumerate(hits):
+            self._add(number, hit.depth_mm, hit.rays.window)
+        if plane is not None:
+            self._add(len(hits), plane.depth_mm(Rays.through(camera, self._image)), self._image)
+
+    def _add(self, number: int, depth_mm: NDArray[np.float64], window: Window) -> None:
+        crop = window.slices_in(self._image)
+        nearer = depth_mm < self.depth_mm[crop]
+        self.depth_mm[crop][nearer] = depth_mm[nearer]
+        self.owner[crop][nearer] = number
+
+    def instance(self, number: int, delta_mm: float) -> InstanceAnnotation:
+        """Counts, boxes and masks of one body."""
+        hit = self._hits[number]
+        crop = hit.rays.window.slices_in(self._image)
+        visible = self.owner[crop] == number
+        if delta_mm > 0:
+            visible = visible_within(hit.depth_mm, self.depth_mm[crop], hit.rays.lengths, delta_mm)
+        return measure_instance(hit.silhouette, hit.window, visible, self._image)
+
+    def normals(self) -> NDArray[np.float32]:
+        """(H, W, 3) geometric unit normals that face the camera; 0 where there is no surface."""
+        of_plane = np.zeros(3) if self._plane is None else self._plane.normal
+        on_plane = self.owner == len(self._hits)
+        result: NDArray[np.float32] = np.array([np.zeros(3), of_plane], dtype=np.float32).take(on_plane, axis=0)
+        for number, hit in enumerate(self._hits):
+            rows, columns = self._seen(number)
+            normals = hit.body.normals(hit.faces[rows, columns])
+            towards = -np.copysign(1.0, np.einsum("ij,ij->i", normals, hit.rays.at(rows, columns)))
+            result[hit.rays.window.slices_in(self._image)][rows, columns] = normals * towards[:, None]
+        return result
+
+    def object_coordinates_mm(self, n_bodies: int) -> NDArray[np.float32]:
+        """(H, W, 3) model coordinates on the first bodies, 0 elsewhere."""
+        result = np.zeros((*self._image.shape, 3), dtype=np.float32)
+        for number, hit in enumerate(self._hits[:n_bodies]):
+            rows, columns = self._seen(number)
+            points = hit.rays.at(rows, columns) * hit.depth_mm[rows, columns, None]
+            result[hit.rays.window.slices_in(self._image)][rows, columns] = hit.body.to_model(points)
+        return result
+
+    def _seen(self, number: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows and columns, in the body's own window inside the image, where it is the nearest."""
+        return pixels_where(self.owner[self._hits[number].rays.window.slices_in(self._image)] == number)
+
+
+def _along(axis: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(h, w) component of the rays (x, y, 1) of a grid along an axis of the camera frame."""
+    component: NDArray[np.float64] = x * axis[0] + (y * axis[1] + axis[2])[:, None]
+    return component

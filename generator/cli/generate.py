@@ -1,0 +1,187 @@
+"""Commands that make images: generate, render, redo."""
+
+from __future__ import annotations
+
+import json
+import sys
+import textwrap
+from dataclasses import asdict
+from itertools import groupby
+from pathlib import Path
+from typing import Annotated, Any, Literal, NoReturn
+
+import typer
+
+from synthetless.config import Recipe, load_recipe, settings
+from synthetless.dataset.layout import SHEET_FILE, Part
+from synthetless.errors import UserError
+from synthetless.generation import devices
+from synthetless.generation.devices import Devices
+from synthetless.generation.drop import DropFailed
+from synthetless.generation.estimate import estimate
+from synthetless.generation.generate import Execution, Summary, generate, redo
+from synthetless.generation.rerender import render_again
+from synthetless.io.files import atomic_write
+from synthetless.io.images import encode_png
+from synthetless.scenes.blender import Kind
+
+EXIT_FAILED, EXIT_WRONG_REQUEST, EXIT_INTERRUPTED = 1, 2, 130
+
+Device = Literal["auto", Kind]
+
+
+def leave(message: str, code: int) -> NoReturn:
+    """End with one line on stderr."""
+    print(f"synthetless: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(code)
+
+
+def settings_help() -> str:
+    """All settings of a recipe, a paragraph for each group; \\b keeps it as it is laid out."""
+    paragraphs = []
+    for _, group in groupby(settings(), key=lambda setting: setting.key.rpartition(".")[0]):
+        lines = ["\b"]
+        for setting in group:
+            lines.append(f"{setting.key}={json.dumps(setting.default)}")
+            lines.append(textwrap.indent(textwrap.fill(" ".join(setting.description.split()), 72), "    "))
+        paragraphs.append("\n".join(lines))
+    return "\n\n".join(["Settings of a recipe, for --set (docs/recipe.md has units and ranges):", *paragraphs])
+
+
+def generate_command(
+    recipe: Annotated[Path, typer.Argument(help="The recipe, a YAML file.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the dataset. Run again to go on with it.")],
+    images: Annotated[
+        int | None, typer.Option(metavar="N", help="How many images; more than before extends the dataset.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Everything random follows from it.")] = None,
+    models: Annotated[
+        str | None,
+        typer.Option(metavar="DIR", help="CAD models as in BOP (obj_000001.ply, ..., models_info.json), or builtin."),
+    ] = None,
+    textures: Annotated[str | None, typer.Option(metavar="DIR", help="Photographs, or builtin.")] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change a setting; may be given several times."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Processes; default: one per core, or per GPU.")
+    ] = None,
+    threads: Annotated[int, typer.Option(min=0, metavar="N", help="Threads of each process; 0: as many as cores.")] = 1,
+    on: Annotated[Device, typer.Option("--device", help="What to render on; auto takes the best.")] = "auto",
+    drop_limit: Annotated[
+        float, typer.Option(min=1, metavar="SECONDS", help="Give up a drop after so many seconds.")
+    ] = 1800,
+    part: Annotated[
+        str | None,
+        typer.Option(metavar="K/N", help="Make part K of N of the drops, beside other machines that make the others."),
+    ] = None,
+    executor: Annotated[
+        Literal["local", "ray"], typer.Option(help="Processes of this machine, or a Ray cluster.")
+    ] = "local",
+    address: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Of the Ray cluster; default: the one that runs here.")
+    ] = None,
+    preview_every: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Draw the contact sheet after every N images, too; 0: in the end.")
+    ] = 50,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only tell what it would take; two images are made to measure.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+) -> None:
+    """Make a dataset: drop, render, measure, label, write.
+
+    Example: synthetless generate configs/demo.yaml --out out/demo --set camera.distance_m='[0.5, 0.8]'
+    """
+    resolved = _resolve(recipe, overrides or [], images, seed, models, textures)
+    if address is not None and executor != "ray":
+        raise UserError(f"--address {address} is of a Ray cluster; add --executor ray")
+    execution = Execution(
+        workers,
+        threads,
+        drop_limit,
+        Part.parse(part) if part else None,
+        devices.choose(on) if executor == "local" else Devices(on),
+        preview_every,
+        (address or "auto") if executor == "ray" else None,
+    )
+    if dry_run:
+        plan = estimate(resolved, out, execution)
+        print(json.dumps(asdict(plan)) if as_json else plan)
+        return
+    try:
+        summary = generate(resolved, out, execution)
+    except KeyboardInterrupt:  # here, since typer would end without a word
+        leave("interrupted; run the same command again to go on", EXIT_INTERRUPTED)
+    _report(summary, out, as_json)
+    if summary.failures:
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _resolve(
+    recipe: Path, overrides: list[str], images: int | None, seed: int | None, models: str | None, textures: str | None
+) -> Recipe:
+    given: list[tuple[str, Any]] = [
+        ("images", images),
+        ("seed", seed),
+        ("source.models", models),
+        ("source.textures", textures),
+    ]
+    direct = [f"{key}={json.dumps(value)}" for key, value in given if value is not None]
+    return load_recipe(recipe, [*overrides, *direct])
+
+
+def _report(summary: Summary, out: Path, as_json: bool) -> None:
+    if as_json:
+        answer = {
+            "images": summary.images,
+            "instances": summary.instances,
+            "made": summary.made,
+            "mean_visib_fract": summary.mean_visib_fract,
+            "failures": summary.failures,
+            "dataset": str(out),
+        }
+        print(json.dumps(answer))
+        return
+    print(
+        f"{summary.images} images ({summary.made} new), {summary.instances} instances, "
+        f"{summary.mean_visib_fract:.0%} visible on average, {len(summary.failures)} failed drops"
+    )
+    for failure in summary.failures:
+        print(f"  {failure}")
+    print(f"dataset: {out}")
+    if (out / SHEET_FILE).exists():
+        print(f"picture: {out / SHEET_FILE}")
+
+
+def render_command(
+    dataset: Annotated[Path, typer.Argument(help="The dataset's folder.")],
+    scene: Annotated[int, typer.Argument(help="Number of the scene folder.")],
+    image: Annotated[int, typer.Argument(help="Image id in it.")],
+    to: Annotated[Path, typer.Option(metavar="FILE", help="PNG file to write.")],
+    textures: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of the photographs, if it has moved.")
+    ] = None,
+) -> None:
+    """Render one recorded image again."""
+    atomic_write(to, encode_png(render_again(dataset, scene, image, textures)))
+    print(to)
+
+
+def redo_command(
+    dataset: Annotated[Path, typer.Argument(help="The dataset's folder.")],
+    drop: Annotated[int, typer.Argument(min=0, help="Number of the drop.")],
+    textures: Annotated[
+        str | None, typer.Option(metavar="DIR", help="Folder of the photographs, if it has moved.")
+    ] = None,
+) -> None:
+    """Make one drop again, to see why it failed.
+
+    It is made alone, in the foreground, and put where it is missing.
+    """
+    try:
+        made = redo(dataset, drop, textures)
+    except DropFailed as failure:
+        leave(f"drop {drop}: {failure}", EXIT_FAILED)
+    print(f"drop {drop}: {made} images in {dataset}")

@@ -1,0 +1,68 @@
+"""Commands that look at things: doctor, preview, validate."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from synthetless.cli.generate import EXIT_FAILED
+from synthetless.cli.options import Split, Workers
+from synthetless.doctor import examine, is_fit, to_json, to_text
+from synthetless.io.files import read_json
+from synthetless.preview import write_preview
+from synthetless.preview.pages import STATISTICS_FILE
+from synthetless.validation import validate
+
+
+def doctor_command(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where datasets are to be made.")] = Path(),
+    as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
+) -> None:
+    """Look whether this machine can make datasets.
+
+    Says what to do where it cannot; then the exit code is 1.
+    """
+    checks = examine(out)
+    print(to_json(checks) if as_json else to_text(checks))
+    if not is_fit(checks):
+        raise typer.Exit(EXIT_FAILED)
+
+
+def preview_command(
+    dataset: Annotated[Path, typer.Argument(help="Folder of a dataset.")],
+    to: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of the pages; default: preview, inside the dataset.")
+    ] = None,
+    split: Split = None,
+    images: Annotated[int | None, typer.Option(min=1, metavar="N", help="Show at most so many, evenly spread.")] = None,
+    workers: Workers = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the statistics as JSON.")] = False,
+) -> None:
+    """Make a gallery and statistics for the browser."""
+    page = write_preview(dataset, to, split, images, workers)
+    statistics = read_json(page.parent / STATISTICS_FILE)
+    print(json.dumps({"page": str(page), "statistics": statistics}) if as_json else f"preview: {page}")
+
+
+def validate_command(
+    dataset: Annotated[Path, typer.Argument(help="The dataset's folder.")],
+    deep: Annotated[bool, typer.Option("--deep", help="Also measure masks and depth of some images again.")] = False,
+    exports: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--export",
+            metavar="PATH",
+            help="A COCO file or shards made from it; may be given several times.",
+        ),
+    ] = None,
+    limit: Annotated[int, typer.Option(min=1, metavar="N", help="How many faults of each kind to show.")] = 20,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> None:
+    """Check every file, every label, and both against each other."""
+    found = validate(dataset, deep, exports or (), limit)
+    print(json.dumps(found.to_json()) if as_json else "\n".join(found.lines()))
+    if not found.valid:
+        raise typer.Exit(EXIT_FAILED)

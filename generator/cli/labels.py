@@ -1,0 +1,101 @@
+"""Commands about labels: relabel, adopt, symmetries detect and show."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from synthetless.cli.options import Workers
+from synthetless.dataset.adopt import adopt
+from synthetless.dataset.card import write_card
+from synthetless.dataset.relabel import relabel
+from synthetless.symmetry.detection import detect_folder, report
+from synthetless.symmetry.detection.gallery import draw_detected, draw_table
+from synthetless.symmetry.detection.show import describe, read_table
+
+TableOption = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Symmetry table (YAML or JSON); it may name some objects only."),
+]
+SchemeOption = Annotated[
+    Literal["pitteri2019", "atlas"] | None,
+    typer.Option(help="pitteri2019: the paper's; atlas: without jumps. Default: the table's own."),
+]
+
+
+def relabel_command(
+    dataset: Annotated[Path, typer.Argument(help="The dataset's folder.")],
+    symmetries: TableOption = None,
+    scheme: SchemeOption = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only tell what would change.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the changes as JSON.")] = False,
+) -> None:
+    """Make the labels again, for other symmetries.
+
+    Images, masks and poses stay as they are. Without options all labels are made again from symmetries.json.
+    """
+    done = relabel(dataset, symmetries, scheme, dry_run)
+    if not dry_run:
+        write_card(dataset)
+    print(json.dumps(asdict(done)) if as_json else done)
+
+
+def adopt_command(
+    dataset: Annotated[Path, typer.Argument(help="Folder of a BOP dataset, with or without images.")],
+    models: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of its models, if they are not in the dataset.")
+    ] = None,
+    symmetries: TableOption = None,
+    scheme: SchemeOption = None,
+) -> None:
+    """Label an existing BOP dataset; its own files stay as they are."""
+    print(adopt(dataset, models, symmetries, scheme))
+
+
+def detect_command(
+    models: Annotated[Path, typer.Argument(help="Folder of PLY, STL, OBJ or OFF files.")],
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Symmetry table to write.")] = None,
+    models_out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="BOP models folder to write, models_info.json too.")
+    ] = None,
+    tolerance_percent: Annotated[
+        float, typer.Option(min=0, metavar="PERCENT", help="Largest residual, in % of the diameter.")
+    ] = 1.0,
+    scale: Annotated[
+        float, typer.Option(min=0, metavar="FACTOR", help="Millimetres per unit of the files; 1000 for metres.")
+    ] = 1.0,
+    pictures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for a picture of each part.")] = None,
+    workers: Workers = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
+) -> None:
+    """Find each mesh's symmetry group.
+
+    The report also tells what every other group would leave as residual.
+    """
+    detected = detect_folder(models, tolerance_percent, scale, workers)
+    if out is not None:
+        detected.table().write(out)
+    if models_out is not None:
+        detected.write_models(models_out)
+    if pictures is not None:
+        draw_detected(detected, pictures, workers)
+    print(json.dumps(detected.to_json()) if as_json else report(detected))
+
+
+def show_command(
+    table: Annotated[Path, typer.Argument(help="Symmetry table, models_info.json, or a folder that holds one.")],
+    models: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of the meshes, for pictures.")] = None,
+    pictures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for a picture of each part.")] = None,
+) -> None:
+    """Tell what a symmetry table means for the labels.
+
+    Regressors, margins, and which views are dangerous.
+    """
+    read = read_table(table)
+    if pictures is not None:
+        draw_table(read, models or (table if table.is_dir() else table.parent), pictures)
+    print(describe(read))

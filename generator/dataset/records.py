@@ -1,0 +1,194 @@
+"""BOP's scenewise layout: where the files of a scene are, and what an image's entry in each of them says.
+
+Format: https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synthetless.annotation.instances import InstanceAnnotation
+from synthetless.errors import UserError
+from synthetless.io.files import read_json, write_json
+from synthetless.scenes.spec import Intrinsics
+
+MIN_VISIB_FRACT = 0.1
+"""Instances with a smaller visible fraction are marked ``ignore`` in scene_gt_coco.json, as bop_toolkit does."""
+
+Entry = dict[str, Any]
+
+
+def write_scene_json(path: Path, entries: Mapping[int, Any]) -> None:
+    """Write a scene's JSON file: one image per line, in ascending order of the image ids.
+
+    Floats keep every bit of their float64.
+
+    Raises:
+        UserError: a number is not finite, or the file cannot be written.
+    """
+    write_json(path, {str(im_id): entries[im_id] for im_id in sorted(entries)})
+
+
+def read_scene_json(path: Path) -> dict[int, Any]:
+    """Read a scene's JSON file, by image id in ascending order.
+
+    Raises:
+        UserError: the file is missing, cut off or damaged, or has a key that is no image id.
+    """
+    content = read_json(path)
+    for key in content:
+        if not key.isdecimal():
+            raise UserError(f'{path}: has the key "{key}"; image ids are needed')
+    return dict(sorted(((int(key), value) for key, value in content.items()), key=lambda entry: entry[0]))
+
+
+def camera_matrix(intrinsics: Intrinsics) -> NDArray[np.float64]:
+    """(3, 3) K of a pinhole camera without skew, pixels."""
+    return np.array(
+        [[intrinsics.fx, 0.0, intrinsics.cx], [0.0, intrinsics.fy, intrinsics.cy], [0.0, 0.0, 1.0]], dtype=np.float64
+    )
+
+
+def camera_json(intrinsics: Intrinsics, depth_scale: float) -> Entry:
+    """The content of a dataset's camera.json; ``depth_scale`` is mm per unit of a depth image."""
+    return {
+        "cx": intrinsics.cx,
+        "cy": intrinsics.cy,
+        "depth_scale": depth_scale,
+        "fx": intrinsics.fx,
+        "fy": intrinsics.fy,
+        "height": intrinsics.height,
+        "width": intrinsics.width,
+    }
+
+
+def camera_entry(
+    K: NDArray[np.float64], R_w2c: NDArray[np.float64], t_w2c: NDArray[np.float64], depth_scale: float
+) -> Entry:
+    """An image's entry in scene_camera.json.
+
+    Args:
+        K: (3, 3) camera matrix, pixels.
+        R_w2c: (3, 3) rotation, world to camera (OpenCV).
+        t_w2c: (3,) translation, world to camera, millimetres.
+        depth_scale: millimetres per unit of the depth image.
+    """
+    return {
+        "cam_K": _floats(K, 9),
+        "cam_R_w2c": _floats(R_w2c, 9),
+        "cam_t_w2c": _floats(t_w2c, 3),
+        "depth_scale": float(depth_scale),
+    }
+
+
+def gt_entry(obj_id: int, R_m2c: NDArray[np.float64], t_m2c: NDArray[np.float64]) -> Entry:
+    """An instance's entry in scene_gt.json: (3, 3) rotation and (3,) translation in mm, model to camera."""
+    return {"cam_R_m2c": _floats(R_m2c, 9), "cam_t_m2c": _floats(t_m2c, 3), "obj_id": int(obj_id)}
+
+
+def gt_info_entry(instance: InstanceAnnotation) -> Entry:
+    """An instance's entry in scene_gt_info.json."""
+    return {
+        "bbox_obj": [int(value) for value in instance.bbox_obj],
+        "bbox_visib": [int(value) for value in instance.bbox_visib],
+        "px_count_all": int(instance.px_count_all),
+        "px_count_valid": int(instance.px_count_valid),
+        "px_count_visib": int(instance.px_count_visib),
+        "visib_fract": float(instance.visib_fract),
+    }
+
+
+def uncompressed_rle(mask: NDArray[np.bool_]) -> Entry:
+    """COCO's uncompressed run lengths, which BOP's files use: column by column, first run outside the mask.
+
+    pycocotools writes compressed runs only, which BOP's own readers of mask.json do not all take.
+    """
+    edges = np.zeros(0, dtype=np.intp)
+    columns = np.flatnonzero(mask.any(axis=0))
+    if columns.size:  # all runs end in these columns, but for the last
+        left, right = int(columns[0]), int(columns[-1]) + 1
+        pixels = np.ascontiguousarray(mask[:, left:right].T).ravel()
+        edges = np.flatnonzero(np.diff(pixels, prepend=False, append=False)) + left * mask.shape[0]
+    if edges.size == 0 or edges[-1] != mask.size:
+        edges = np.append(edges, mask.size)
+    return {"counts": np.diff(edges, prepend=0).tolist(), "size": [int(side) for side in mask.shape]}
+
+
+def amodal_box(mask: NDArray[np.bool_]) -> list[int]:
+    """COCO's [x, y, w, h] of a mask that is not empty, with w = xmax - xmin + 1."""
+    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
+    x, y = int(columns[0]), int(rows[0])
+    return [x, y, int(columns[-1]) - x + 1, int(rows[-1]) - y + 1]
+
+
+def coco_annotations(im_id: int, obj_ids: Sequence[int], instances: Sequence[InstanceAnnotation]) -> list[Entry]:
+    """An image's annotations for scene_gt_coco.json, without their ids, which ``scene_gt_coco`` counts.
+
+    The box is amodal, inside the image. Instances of which nothing is visible are left out.
+
+    Args:
+        im_id: the image.
+        obj_ids: BOP object ids, in the order of ``instances``.
+        instances: what is measured of the image.
+    """
+    return [
+        {
+            "area": int(instance.px_count_visib),
+            "bbox": amodal_box(instance.mask),
+            "category_id": int(obj_id),
+            "height": int(instance.mask.shape[0]),
+            "ignore": bool(instance.visib_fract < MIN_VISIB_FRACT),
+            "image_id": int(im_id),
+            "iscrowd": 0,
+            "segmentation": uncompressed_rle(instance.mask_visib),
+            "width": int(instance.mask.shape[1]),
+        }
+        for obj_id, instance in zip(obj_ids, instances, strict=True)
+        if instance.mask_visib.any()
+    ]
+
+
+def coco_image(im_id: int, rgb: Path, width: int, height: int) -> Entry:
+    """An image's entry in scene_gt_coco.json; ``rgb`` is its file, SCENE/rgb/NAME."""
+    return {
+        "coco_url": "",
+        "date_captured": "",
+        "file_name": f"{rgb.parent.name}/{rgb.name}",
+        "flickr_url": "",
+        "height": height,
+        "id": im_id,
+        "license": 1,
+        "width": width,
+    }
+
+
+def scene_gt_coco(
+    dataset_name: str, obj_ids: Iterable[int], images: Iterable[Entry], annotations: Iterable[Entry]
+) -> Entry:
+    """The content of scene_gt_coco.json, for ``synthetless.io.files.write_json``.
+
+    Args:
+        dataset_name: as BOP calls it, "tless"; the supercategory of all objects.
+        obj_ids: every object of the dataset, whether it occurs or not.
+        images: ``coco_image`` of every image.
+        annotations: ``coco_annotations`` of the images, one after the other; they are numbered from 1.
+    """
+    return {
+        "annotations": [{**annotation, "id": number} for number, annotation in enumerate(annotations, start=1)],
+        "categories": [
+            {"id": obj_id, "name": str(obj_id), "supercategory": dataset_name} for obj_id in sorted(set(obj_ids))
+        ],
+        "images": list(images),
+        "info": {"contributor": "", "description": dataset_name, "url": "", "version": "0.1.0"},
+        "licenses": [],
+    }
+
+
+def _floats(array: NDArray[np.float64], count: int) -> list[float]:
+    values: list[float] = np.asarray(array, dtype=np.float64).reshape(count).tolist()
+    return values

@@ -1,0 +1,210 @@
+"""Makes a dataset: what is missing of it, drop by drop, until it is complete."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from tqdm import tqdm
+
+from synthetless.config import Recipe
+from synthetless.dataset import records
+from synthetless.dataset.layout import DATASET_FILE, FAILURES_FOLDER, SHEET_FILE, Part, by_drop, plan_image, scene_ids
+from synthetless.dataset.sheet import write_contact_sheet
+from synthetless.dataset.store import Dataset
+from synthetless.errors import UserError
+from synthetless.generation import cluster, executors
+from synthetless.generation.devices import CPU, Devices
+from synthetless.generation.drop import Studio
+from synthetless.generation.executors import Job, Outcome, Workplace
+from synthetless.generation.rerender import read_recipe
+from synthetless.generation.sources import Sources, check_photos, load_sources
+from synthetless.io.files import in_turn, locked, write_json
+from synthetless.io.parallel import usable_cores
+from synthetless.scenes.sampling import sample_scene
+
+_BETWEEN_ASSEMBLIES_S = 60.0
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What there is after a run.
+
+    Attributes:
+        images, instances: in the whole dataset.
+        made: images made by this run.
+        mean_visib_fract: over all instances, 0 if there are none.
+        failures: one line for each drop that failed.
+    """
+
+    images: int
+    instances: int
+    made: int
+    mean_visib_fract: float
+    failures: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Execution:
+    """How the work is done; nothing of it changes what is made.
+
+    Attributes:
+        workers: processes that make drops side by side; None for as many as there are cores, or GPUs.
+        threads: of the renderer in each of them; 0 uses every core.
+        drop_limit_s: a drop that takes longer is given up.
+        part: the share of the drops to make; None for all of them. Other machines may make the others meanwhile.
+        devices: what to render on. The same images come from any CPU; those of a GPU differ by some noise.
+        preview_every: after the first drop, and whenever so many more images are made, the contact sheet is drawn; 0
+            for only in the end.
+        cluster: address of the Ray cluster to make them on ("auto" for the one that runs here); None for processes of
+            this machine.
+    """
+
+    workers: int | None = None
+    threads: int = 1
+    drop_limit_s: float = 1800.0
+    part: Part | None = None
+    devices: Devices = CPU
+    preview_every: int = 0
+    cluster: str | None = None
+
+    @property
+    def processes(self) -> int:
+        """How many workers this machine gets: one per core, or per GPU, if not said."""
+        of_machine = usable_cores() if self.devices.kind == "cpu" else self.devices.count
+        return self.workers or of_machine
+
+
+def generate(recipe: Recipe, out: Path, execution: Execution) -> Summary:
+    """Make the images that the dataset in ``out`` lacks; an interrupted run is gone on with.
+
+    Args:
+        recipe: what to make.
+        out: the dataset's folder.
+        execution: how.
+
+    Raises:
+        UserError: the recipe's sources or the folder cannot be used, or a file cannot be written.
+        BlenderError: Blender cannot be used.
+    """
+    sources = load_sources(recipe)
+    if not (out / DATASET_FILE).exists():
+        check_photos(sources)
+    dataset = Dataset.open(out, recipe, sources.models, sources.scenery_digest)
+    with locked(out, execution.part.name if execution.part else None):
+        missing = wanted(dataset, execution.part)
+        failures: list[Outcome] = []
+        try:
+            if missing:
+                failures = _make(dataset, sources, missing, execution)
+        except BaseException:  # an interrupted dataset can be looked at, too
+            dataset.assemble()
+            raise
+        dataset.finish()
+        summary = _summarise(dataset, len(missing) - len(wanted(dataset, execution.part)), failures)
+        if summary.images:
+            _draw_sheet(dataset)
+    return summary
+
+
+def wanted(dataset: Dataset, part: Part | None) -> list[int]:
+    """Numbers of the images that do not exist yet and are this run's to make."""
+    views = dataset.recipe.camera.views_per_drop
+    return [number for number in dataset.missing() if part is None or part.takes(plan_image(number, views).drop)]
+
+
+def redo(out: Path, drop: int, textures: str | None = None) -> int:
+    """Make the images of one drop again in this process, with all cores, and put them where they are missing.
+
+    Args:
+        out: the dataset's folder.
+        drop: number of the drop.
+        textures: folder of the photographs, if it has moved since.
+
+    Returns:
+        How many images were made.
+
+    Raises:
+        DropFailed: it does not come to rest.
+        UserError: the dataset, or what it was made from, cannot be used.
+    """
+    recipe = read_recipe(out)
+    if textures is not None:
+        recipe = recipe.model_copy(update={"source": recipe.source.model_copy(update={"textures": textures})})
+    sources = load_sources(recipe)
+    dataset = Dataset.open(out, recipe, sources.models, sources.scenery_digest)
+    views = recipe.camera.views_per_drop
+    plans = [plan_image(number, views) for number in range(drop * views, min((drop + 1) * views, recipe.images))]
+    if not plans:
+        raise UserError(f"{out}: has no drop {drop}; its {recipe.images} images show the drops from 0 on")
+    with locked(out):
+        for image in Studio(recipe, sources).make(drop, plans):
+            dataset.commit(image)
+        (out / FAILURES_FOLDER / f"{drop:08d}.json").unlink(missing_ok=True)
+        dataset.finish()
+    return len(plans)
+
+
+def _make(dataset: Dataset, sources: Sources, missing: list[int], execution: Execution) -> list[Outcome]:
+    """Make the missing images; return the drops that failed, in their order."""
+    failures: list[Outcome] = []
+    jobs = [Job(drop, tuple(images)) for drop, images in by_drop(missing, dataset.recipe.camera.views_per_drop)]
+    interval = 0.5 if sys.stderr.isatty() else 60.0
+    next_sheet: float = 1 if execution.preview_every else math.inf
+    with tqdm(total=len(missing), unit="image", mininterval=interval, maxinterval=interval, smoothing=0.05) as bar:
+        assembled = time.monotonic()
+        for outcome in _outcomes(dataset, jobs, execution):
+            bar.update(outcome.made)
+            _note_failure(dataset, sources, outcome)
+            if outcome.failure:
+                failures.append(outcome)
+                bar.set_postfix(failed=len(failures))
+            if bar.n >= next_sheet or time.monotonic() - assembled > _BETWEEN_ASSEMBLIES_S:
+                dataset.assemble()
+                assembled = time.monotonic()
+            if bar.n >= next_sheet:
+                _draw_sheet(dataset)
+                next_sheet = bar.n + execution.preview_every
+    return sorted(failures, key=lambda outcome: outcome.job.drop)
+
+
+def _outcomes(dataset: Dataset, jobs: list[Job], execution: Execution) -> Iterator[Outcome]:
+    place = Workplace(dataset.recipe, dataset.root, execution.threads, execution.drop_limit_s, execution.devices)
+    if execution.cluster is not None:
+        return cluster.run(jobs, place, execution.cluster, execution.workers)
+    return executors.run(jobs, place, min(execution.processes, len(jobs)))
+
+
+def _draw_sheet(dataset: Dataset) -> None:
+    if "rgb" in dataset.recipe.outputs:
+        with in_turn(dataset.root):  # or the sheet of another part, drawn of fewer images, might come last
+            write_contact_sheet(dataset.root, dataset.root / SHEET_FILE, dataset.recipe.split)
+
+
+def _note_failure(dataset: Dataset, sources: Sources, outcome: Outcome) -> None:
+    """Leave a note of a failed drop with the scene that it began with; take away that of one that went well."""
+    drop, recipe = outcome.job.drop, dataset.recipe
+    path = dataset.root / FAILURES_FOLDER / f"{drop:08d}.json"
+    if outcome.failure:
+        scene = sample_scene(recipe, sources.catalogue, recipe.seed, drop)
+        write_json(path, {"drop": drop, "failure": outcome.failure, "scene": asdict(scene)})
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _summarise(dataset: Dataset, made: int, failures: list[Outcome]) -> Summary:
+    images, fractions = 0, []
+    made_any = (dataset.root / dataset.recipe.split).is_dir()
+    for scene_id in scene_ids(dataset.root, dataset.recipe.split) if made_any else []:
+        infos = records.read_scene_json(dataset.scene(scene_id).scene_gt_info)
+        images += len(infos)
+        fractions += [entry["visib_fract"] for entries in infos.values() for entry in entries]
+    mean = sum(fractions) / len(fractions) if fractions else 0.0
+    told = tuple(
+        f"drop {o.job.drop}: {o.failure}; try it alone: synthetless redo {dataset.root} {o.job.drop}" for o in failures
+    )
+    return Summary(images, len(fractions), made, mean, told)

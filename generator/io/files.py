@@ -1,0 +1,237 @@
+"""Files that are whole or absent, written beside their place and then renamed into it; and locks on folders."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import socket
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from itertools import count
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from synthetless.errors import UserError
+
+
+@contextmanager
+def atomic_file(path: Path, durable: bool = False) -> Iterator[BinaryIO]:
+    """A binary file to write, which takes the place of ``path`` when the block ends well and vanishes otherwise.
+
+    Args:
+        path: where the file is to be; missing parent folders are made.
+        durable: wait until the content is on the disk before the renaming, so that not even a power cut leaves
+            an empty file. Costs milliseconds.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    draft = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with draft.open("wb") as file:
+            yield file
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
+        draft.replace(path)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        with suppress(OSError):
+            draft.unlink()
+
+
+def atomic_write(path: Path, data: bytes, durable: bool = False) -> None:
+    """Write a whole file at once; arguments and errors as in ``atomic_file``."""
+    with atomic_file(path, durable) as file:
+        file.write(data)
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """A folder to fill, which becomes ``path`` when the block ends well and vanishes otherwise.
+
+    Raises:
+        UserError: ``path`` is a file or a folder that holds something, or cannot be written.
+    """
+    path = path.resolve()
+    draft = path.with_name(f".{path.name}.part")
+    try:
+        if path.is_file() or (path.is_dir() and any(path.iterdir())):
+            raise UserError(f"{path}: exists already; give a new or an empty folder")
+        shutil.rmtree(draft, ignore_errors=True)
+        draft.mkdir(parents=True)
+        yield draft
+        draft.replace(path)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON object with one entry per line, in the mapping's order, keys inside the entries sorted.
+
+    Floats are written with as many digits as it takes to read the same float64 back.
+
+    Raises:
+        UserError: a number is not finite, or the file cannot be written.
+    """
+    atomic_write(path, json_bytes(path, content), durable=True)
+
+
+def json_bytes(path: Path, content: Mapping[str, Any]) -> bytes:
+    """What ``write_json`` writes to ``path``, which here only tells where a number is not finite.
+
+    Raises:
+        UserError: a number is not finite.
+    """
+    lines = (f"  {json.dumps(key)}: {_line(path, value)}" for key, value in content.items())
+    return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        UserError: the file is missing, is cut off or otherwise no JSON, names a key twice, or holds something
+            else than an object.
+    """
+    content = _parse(read_bytes(path), str(path))
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: holds a JSON {type(content).__name__}; an object is needed")
+    return content
+
+
+def write_json_lines(path: Path, records: Iterable[Any]) -> None:
+    """Write one JSON value per line; errors as in ``write_json``."""
+    atomic_write(path, "".join(_line(path, record) + "\n" for record in records).encode(), durable=True)
+
+
+def read_json_lines(path: Path) -> list[Any]:
+    """Read one JSON value per line.
+
+    Raises:
+        UserError: the file is missing, or a line is no JSON; the message names the line.
+    """
+    lines = read_bytes(path).splitlines()
+    return [_parse(line, f"{path}, line {number}") for number, line in enumerate(lines, start=1)]
+
+
+def read_bytes(path: Path) -> bytes:
+    """The content of a file.
+
+    Raises:
+        UserError: it is missing or unreadable.
+    """
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise UserError(f"{path}: not found") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def _line(path: Path, value: Any) -> str:
+    try:
+        return json.dumps(value, sort_keys=True, allow_nan=False)
+    except ValueError as error:
+        raise UserError(f"{path}: not written, a number in it is not finite ({error})") from None
+
+
+def _parse(data: bytes, place: str) -> Any:
+    try:
+        return json.loads(data, object_pairs_hook=_unique)
+    except ValueError as error:  # JSONDecodeError, UnicodeDecodeError and the hook's own
+        raise UserError(f"{place}: not valid JSON, cut off or damaged ({error})") from None
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise UserError(f'key "{next(key for key in keys if keys.count(key) > 1)}" occurs twice')
+    return content
+
+
+class LockedError(UserError):
+    """Another process is at work in the folder; the message is one line."""
+
+
+@contextmanager
+def locked(root: Path, part: str | None = None) -> Iterator[None]:
+    """Keep other writers out of a dataset's folder for the duration; those of other parts may come in.
+
+    Args:
+        root: the dataset's folder.
+        part: name of the share of the work that is done; None for all of it.
+
+    Raises:
+        LockedError: another process is at work in it.
+        UserError: the folder cannot be written.
+    """
+    whole = root / ".synthetless.lock"
+    busy = f"{root}: another synthetless is writing here; let it finish, or stop it"
+    if part is None:
+        with _flock(whole, fcntl.LOCK_EX | fcntl.LOCK_NB, busy):
+            yield
+    else:
+        own = root / f".synthetless.{part}.lock"
+        with _flock(whole, fcntl.LOCK_SH | fcntl.LOCK_NB, busy), _flock(own, fcntl.LOCK_EX | fcntl.LOCK_NB, busy):
+            yield
+
+
+@contextmanager
+def in_turn(root: Path) -> Iterator[None]:
+    """Wait until no other process assembles the folder, and keep them waiting for the duration."""
+    while True:
+        try:
+            with _flock(root / ".synthetless.assembly.lock", fcntl.LOCK_EX, ""):
+                yield
+                return
+        except LockedError:  # the one before has taken the file away
+            continue
+
+
+def claim(name: str) -> int:
+    """Take the first number, counted from 0, that no other process of this user on this machine has taken.
+
+    It is given back when this process ends, however that comes about.
+    """
+    folder = Path(tempfile.gettempdir()) / f"synthetless-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    for number in count():
+        lock = os.open(folder / f"{name}-{number}.lock", os.O_CREAT | os.O_RDWR, 0o600)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the descriptor is open
+        except OSError:
+            os.close(lock)
+        else:
+            return number
+    raise AssertionError("there are always more numbers")
+
+
+@contextmanager
+def _flock(path: Path, mode: int, busy: str) -> Iterator[None]:
+    """Hold a lock file; who holds it alone takes it away in the end, so that nothing of the lock remains."""
+    try:
+        lock = path.open("a")
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror})") from None
+    with lock:
+        try:
+            fcntl.flock(lock, mode)
+            taken_away = not os.path.samestat(path.stat(), os.fstat(lock.fileno()))
+        except OSError:
+            raise LockedError(busy) from None
+        if taken_away:
+            raise LockedError(busy)
+        try:
+            yield
+        finally:
+            if mode & fcntl.LOCK_EX:
+                path.unlink(missing_ok=True)

@@ -1,0 +1,85 @@
+"""The pages themselves: templates filled in, with everything that comes from a dataset escaped."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from importlib.resources import as_file, files
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from synthetless.dataset.sheet import class_color
+from synthetless.errors import UserError
+from synthetless.io.files import atomic_write
+from synthetless.preview.statistics import Statistics
+from synthetless.preview.statistics.plots import plots
+
+PAGE_FILE, STATISTICS_FILE = "index.html", "statistics.json"
+STATIC_FILES = ("preview.css", "gallery.js", "viewer.js")
+_GROUPS = ("labels", "objects", "camera", "light", "table", "image")
+_PACKAGE = "synthetless.preview"
+_MARK = '<meta name="generator" content="synthetless preview">'
+
+
+def is_ours(folder: Path) -> bool:
+    """Whether a folder is empty or a preview, which a new one may replace."""
+    page = folder / PAGE_FILE
+    if not folder.is_dir():
+        return False
+    return _MARK in page.read_text(encoding="utf-8", errors="replace") if page.is_file() else not any(folder.iterdir())
+
+
+def write_pages(folder: Path, title: str, split: str, images: int) -> None:
+    """Write the gallery's page and what it needs beside the data.
+
+    Raises:
+        UserError: the extra that brings the templates is not installed, or a file cannot be written.
+    """
+    atomic_write(folder / PAGE_FILE, render("gallery.html", title=title, split=split, images=images).encode())
+    for name in STATIC_FILES:
+        with as_file(files(_PACKAGE) / "static" / name) as path:
+            shutil.copyfile(path, folder / name)
+
+
+def write_statistics(folder: Path, title: str, of: Statistics, names: Mapping[int, str]) -> None:
+    """Write the page of the statistics, its plots, and the numbers as JSON; ``names`` are the objects', by id.
+
+    Raises:
+        UserError: as ``write_pages``.
+    """
+    content = json.dumps(of.to_json(), indent=1, allow_nan=False)
+    atomic_write(folder / STATISTICS_FILE, f"{content}\n".encode())
+    for name, svg in plots(of):
+        atomic_write(folder / "plots" / f"{name}.svg", svg)
+    ordered = sorted(of.distributions, key=lambda each: _GROUPS.index(each.group))
+    groups = [(group, list(members)) for group, members in groupby(ordered, key=lambda each: each.group)]
+    page = render(
+        "statistics.html", title=title, of=of, groups=groups, names=names, recipe=of.drops > 0, colour=_colour
+    )
+    atomic_write(folder / "statistics.html", page.encode())
+
+
+def _colour(obj_id: int) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*class_color(obj_id))
+
+
+def render(template: str, **values: Any) -> str:
+    """A template filled in; every value is escaped.
+
+    Raises:
+        UserError: the extra that brings the templates is not installed.
+    """
+    try:
+        from jinja2 import Environment, PackageLoader, StrictUndefined
+    except ImportError:
+        raise UserError("a preview needs jinja2 and matplotlib: pip install 'synthetless[preview]'") from None
+    environment = Environment(
+        loader=PackageLoader("synthetless.preview"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(**values)

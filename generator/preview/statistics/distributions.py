@@ -1,0 +1,265 @@
+"""Histograms of everything a recipe draws, and of what follows from it, each beside what was asked."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synthetless.config import BUILTIN, Recipe
+from synthetless.preview.statistics.collect import Observations
+from synthetless.preview.statistics.uniformity import categories_p, rotations_p, uniform_p
+from synthetless.scenes.spec import ObjectSpec
+from synthetless.scenes.textures import FAMILIES, PhotoTexture
+
+Floats = NDArray[np.float64]
+Bounds = tuple[float, float]
+Verdict = Literal["as asked", "differs", "too few to judge", "not prescribed"]
+
+SIGNIFICANCE = 1e-4
+"""A deviation that the recipe would bring about less often than this is called one: there are some thirty tests."""
+
+_BINS = 24
+_CANDLE_GREEN = 0.56  # linear green of a lamp of warmth 1, see scenes.sampling
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """How often something takes which value.
+
+    Attributes:
+        key: its name in files.
+        group: what it belongs to: objects, labels, camera, light, table or image.
+        title: what it is, with its unit.
+        asked: what the recipe asked for, in words.
+        values: how many values there are.
+        edges: (B + 1) bounds of the histogram's bins; () if there are categories.
+        categories: names of the categories, or ().
+        counts: values in each bin or category.
+        expected: how many the recipe makes one expect there; None if it asks for nothing.
+        bounds: range that all values are to be in, if that is all that is asked.
+        p_value: how likely a deviation as large is under the recipe; None where that was not or cannot be judged.
+    """
+
+    key: str
+    group: str
+    title: str
+    asked: str
+    values: int
+    edges: tuple[float, ...]
+    categories: tuple[str, ...]
+    counts: tuple[int, ...]
+    expected: tuple[float, ...] | None
+    bounds: Bounds | None
+    p_value: float | None
+
+    @property
+    def verdict(self) -> Verdict:
+        """What to make of it."""
+        if self.expected is None and self.bounds is None:
+            return "not prescribed"
+        if self.p_value is None:
+            return "too few to judge"
+        return "differs" if self.p_value < SIGNIFICANCE else "as asked"
+
+
+def labelled_classes(seen: Observations, offered: Sequence[int], recipe: Recipe | None) -> Distribution:
+    """Labelled instances per class; ``offered`` are the object ids that were drawn from."""
+    found = Counter(seen.instances.obj_id.tolist())
+    ids = sorted({*offered, *found})
+    drawn = dict.fromkeys(offered, 1.0) if recipe is not None else None
+    repeats = recipe.camera.views_per_drop if recipe is not None else 1
+    named = {str(obj_id): found[obj_id] for obj_id in ids}
+    weights = None if drawn is None else {str(obj_id): drawn.get(obj_id, 0.0) for obj_id in ids}
+    asked = "each object equally often"
+    return _categories("classes", "objects", "Labelled instances of each class", named, weights, asked, repeats)
+
+
+def distributions(seen: Observations, recipe: Recipe | None) -> Iterator[Distribution]:
+    """All others; those of recorded scenes only where scenes were recorded."""
+    yield from _labels(seen)
+    if recipe is None or not seen.drops:
+        return
+    yield from _objects(seen, recipe)
+    yield from _camera(seen, recipe)
+    yield from _light(seen, recipe)
+    yield from _table(seen, recipe)
+    yield from _image(seen, recipe)
+
+
+def _labels(seen: Observations) -> Iterator[Distribution]:
+    counts = Counter(seen.objects_per_image.tolist())
+    named = {str(n): counts[n] for n in range(max(counts, default=0) + 1)}
+    yield _categories("labels_per_image", "labels", "Labelled instances of an image", named, None, "")
+    yield _histogram("visib_fract", "labels", "Visible fraction", seen.instances.visib_fract, (0.0, 1.0))
+    distance_m = np.linalg.norm(seen.instances.t_m2c, axis=1) / 1000
+    yield _histogram("object_distance", "labels", "Distance of the objects, m", distance_m)
+
+
+def _objects(seen: Observations, recipe: Recipe) -> Iterator[Distribution]:
+    items = [item for spec in seen.drops for item in spec.objects]
+    low, high = recipe.objects.count
+    dropped = Counter(sum(item.role == "model" for item in spec.objects) for spec in seen.drops)
+    sizes = range(min(low, *dropped), max(high, *dropped) + 1)
+    named = {str(n): dropped[n] for n in sizes}
+    weights = {str(n): float(low <= n <= high) for n in sizes}
+    yield _categories("objects_per_drop", "objects", "Objects dropped", named, weights, f"each of {low} to {high}")
+    yield _release(items)
+    if recipe.objects.tint == 0:
+        grey = np.array([_displayed(item.material.albedo[0]) for item in items])
+        yield _uniform("grey", "objects", "Grey, as displayed", grey, recipe.objects.grey)
+    for name, bounds in (("roughness", recipe.objects.roughness), ("specular", recipe.objects.specular)):
+        values = np.array([getattr(item.material, name) for item in items])
+        yield _uniform(f"object_{name}", "objects", f"{name.capitalize()} of the objects", values, bounds)
+
+
+def _release(items: Sequence[ObjectSpec]) -> Distribution:
+    """Angles of rotations uniform on SO(3) have the density (1 - cos a) / pi; the test is of the rotations."""
+    wxyz = np.array([item.release.rotation_wxyz for item in items])
+    angle_deg = np.degrees(2 * np.arccos(np.clip(np.abs(wxyz[:, 0]), 0, 1)))
+    edges = np.linspace(0, 180, _BINS + 1)
+    share = np.diff(np.radians(edges) - np.sin(np.radians(edges))) / np.pi
+    asked, p_value = "uniform over all rotations", rotations_p(wxyz)
+    return _binned("release", "objects", "Angle of the release rotations, °", angle_deg, edges, share, asked, p_value)
+
+
+def _camera(seen: Observations, recipe: Recipe) -> Iterator[Distribution]:
+    asked = recipe.camera
+    for name, title, bounds in (
+        ("distance_m", "Distance of the camera, m", asked.distance_m),
+        ("elevation_deg", "Elevation of the camera, °", asked.elevation_deg),
+        ("azimuth_deg", "Azimuth of the camera, °", asked.azimuth_deg),
+        ("roll_deg", "Roll of the camera, °", asked.roll_deg),
+    ):
+        values = np.array([getattr(view, name) for view in seen.views])
+        yield _uniform(f"camera_{name}", "camera", title, values, bounds)
+
+
+def _light(seen: Observations, recipe: Recipe) -> Iterator[Distribution]:
+    asked = recipe.light
+    for name, title, bounds in (
+        ("azimuth_deg", "Azimuth of the lamp, °", asked.azimuth_deg),
+        ("elevation_deg", "Elevation of the lamp, °", asked.elevation_deg),
+        ("distance_m", "Distance of the lamp, m", asked.distance_m),
+        ("strength", "Strength of the lamp", asked.strength),
+        ("radius_m", "Radius of the lamp, m", asked.radius_m),
+    ):
+        values = np.array([getattr(spec.light, name) for spec in seen.drops])
+        yield _uniform(f"light_{name}", "light", title, values, bounds)
+    warmth = np.array([(1 - spec.light.color[1]) / (1 - _CANDLE_GREEN) for spec in seen.drops])
+    yield _uniform("light_warmth", "light", "Warmth of the lamp", warmth, asked.warmth)
+    ambient = np.array([spec.ambient.level for spec in seen.drops])
+    yield _uniform("ambient", "light", "Ambient level", ambient, asked.ambient)
+
+
+def _table(seen: Observations, recipe: Recipe) -> Iterator[Distribution]:
+    planes = [spec.plane for spec in seen.drops]
+    textures = (plane.texture for plane in planes)
+    found = Counter(texture.file if isinstance(texture, PhotoTexture) else texture.family for texture in textures)
+    builtin = recipe.source.textures == BUILTIN
+    names = sorted({*found, *(FAMILIES if builtin else ())})
+    weights = dict.fromkeys(names, 1.0) if builtin else None
+    named = {name: found[name] for name in names}
+    yield _categories("texture", "table", "Texture of the table", named, weights, "each family equally often")
+    low, high = recipe.table.tile_m
+    tile, ends = np.log10([plane.tile_m for plane in planes]), (float(np.log10(low)), float(np.log10(high)))
+    asked = f"log-uniform in {low:g} to {high:g} m"
+    yield _uniform("tile", "table", "Side of a texture tile, log10 of m", tile, ends, asked)
+    turned = np.array([plane.rotation_deg for plane in planes])
+    yield _uniform("table_rotation", "table", "Rotation of the texture, °", turned, (0.0, 360.0))
+    for name, bounds in (("roughness", recipe.table.roughness), ("specular", recipe.table.specular)):
+        values = np.array([getattr(plane, name) for plane in planes])
+        yield _uniform(f"table_{name}", "table", f"{name.capitalize()} of the table", values, bounds)
+
+
+def _image(seen: Observations, recipe: Recipe) -> Iterator[Distribution]:
+    low, high = recipe.render.exposure
+    if seen.luminance.size:
+        kept = bool((seen.luminance > low - 0.02).all() and (seen.luminance < high + 0.02).all())
+        edges = np.linspace(0, 1, _BINS + 1)
+        asked, p_value = f"within {low:g} to {high:g}", float(kept)
+        title = "Mean luminance, as displayed"
+        yield _binned("luminance", "image", title, seen.luminance, edges, None, asked, p_value, (low, high))
+    yield _histogram("exposure_gain", "image", "Exposure, stops", np.log2(seen.exposure_gains))
+
+
+def _uniform(key: str, group: str, title: str, values: Floats, bounds: Bounds, asked: str = "") -> Distribution:
+    low, high = bounds
+    if low == high:
+        edges = np.linspace(*_range(np.append(values, low)), _BINS + 1)
+        kept = float(bool(np.allclose(values, low)))
+        return _binned(key, group, title, values, edges, None, f"always {low:g}", kept, bounds)
+    edges = np.linspace(min(low, values.min(initial=low)), max(high, values.max(initial=high)), _BINS + 1)
+    share = np.diff(np.clip((edges - low) / (high - low), 0, 1))
+    asked = asked or f"uniform in {low:g} to {high:g}"
+    return _binned(key, group, title, values, edges, share, asked, uniform_p(values, low, high))
+
+
+def _histogram(key: str, group: str, title: str, values: Floats, bounds: Bounds | None = None) -> Distribution:
+    edges = np.linspace(*(bounds or _range(values)), _BINS + 1)
+    return _binned(key, group, title, values, edges, None, "", None)
+
+
+def _binned(
+    key: str,
+    group: str,
+    title: str,
+    values: Floats,
+    edges: Floats,
+    share: Floats | None,
+    asked: str,
+    p_value: float | None,
+    bounds: Bounds | None = None,
+) -> Distribution:
+    counts = np.histogram(values, edges)[0]
+    expected = None if share is None else tuple((share * values.size).tolist())
+    return Distribution(
+        key,
+        group,
+        title,
+        asked,
+        values.size,
+        tuple(edges.tolist()),
+        (),
+        tuple(counts.tolist()),
+        expected,
+        bounds,
+        p_value,
+    )
+
+
+def _categories(
+    key: str,
+    group: str,
+    title: str,
+    counts: dict[str, int],
+    weights: dict[str, float] | None,
+    asked: str,
+    repeats: float = 1.0,
+) -> Distribution:
+    found, total = tuple(counts.values()), sum(counts.values())
+    expected: tuple[float, ...] | None = None
+    p_value = None
+    if weights is not None:
+        whole = sum(weights.values())
+        expected = tuple(total * weights[name] / whole for name in counts)
+        p_value = categories_p(found, expected, repeats)
+    words = asked if weights is not None else ""
+    return Distribution(key, group, title, words, total, (), tuple(counts), found, expected, None, p_value)
+
+
+def _range(values: Floats) -> Bounds:
+    """Bounds of a histogram of values about which nothing is known."""
+    if not values.size:
+        return 0.0, 1.0
+    low, high = float(values.min()), float(values.max())
+    return (low, high) if high - low > 1e-9 else (low - 0.5, high + 0.5)
+
+
+def _displayed(linear: float) -> float:
+    """sRGB value of a linear one (IEC 61966-2-1)."""
+    return 12.92 * linear if linear <= 0.0031308 else 1.055 * float(linear) ** (1 / 2.4) - 0.055

@@ -1,0 +1,201 @@
+"""The command line: what a wrong request is answered with, and that it leaves nothing behind."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from synthetless.cli.app import main
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
+    """Run the command in this process; returns its exit code, stdout and stderr."""
+
+    def invoke(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["synthetless", *map(str, arguments)])
+        code = 0
+        try:
+            main()
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        printed = capfd.readouterr()
+        return code, printed.out, printed.err
+
+    return invoke
+
+
+@pytest.fixture
+def inputs(tmp_path: Path) -> Path:
+    """A folder with a small recipe, one model and one photograph, all good."""
+    models, photos = tmp_path / "in" / "models", tmp_path / "in" / "photos"
+    models.mkdir(parents=True)
+    photos.mkdir()
+    trimesh.creation.box((30, 20, 10)).export(models / "obj_000001.ply")
+    info = {"diameter": float(np.sqrt(1400))}
+    for axis, side in zip("xyz", (30.0, 20.0, 10.0), strict=True):
+        info |= {f"min_{axis}": -side / 2, f"size_{axis}": side}
+    (models / "models_info.json").write_text(json.dumps({"1": info}))
+    cv2.imwrite(str(photos / "wall.jpg"), np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8))
+    (tmp_path / "in" / "recipe.yaml").write_text("images: 1\nobjects: {count: [1, 1]}\n")
+    return tmp_path / "in"
+
+
+def _reflection(inputs: Path) -> None:
+    path = inputs / "models" / "models_info.json"
+    infos = json.loads(path.read_text())
+    infos["1"]["symmetries_discrete"] = [[-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]
+    path.write_text(json.dumps(infos))
+
+
+def _nan_vertex(inputs: Path) -> None:
+    box = trimesh.creation.box((30, 20, 10))
+    vertices = np.array(box.vertices)
+    vertices[3, 1] = np.nan
+    trimesh.Trimesh(vertices, box.faces, process=False).export(inputs / "models" / "obj_000001.ply")
+
+
+def _without_faces(inputs: Path) -> None:
+    trimesh.PointCloud(trimesh.creation.box((30, 20, 10)).vertices).export(inputs / "models" / "obj_000001.ply")
+
+
+def _truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+BAD_INPUT: dict[str, tuple[Callable[[Path], object], list[str], list[str]]] = {
+    "no models folder": (lambda i: shutil.rmtree(i / "models"), [], ["models", "no such models folder"]),
+    "empty models folder": (
+        lambda i: [path.unlink() for path in (i / "models").iterdir()],
+        [],
+        ["models", "holds no models", "obj_000001.ply"],
+    ),
+    "broken ply": (lambda i: _truncate(i / "models" / "obj_000001.ply"), [], ["obj_000001.ply"]),
+    "mesh without faces": (_without_faces, [], ["obj_000001.ply", "no faces"]),
+    "nan vertices": (_nan_vertex, [], ["obj_000001.ply", "vertex 3", "nan"]),
+    "info lacks an object": (
+        lambda i: (i / "models" / "models_info.json").write_text("{}"),
+        [],
+        ["models_info.json", "no entry for object 1"],
+    ),
+    "symmetry is a reflection": (_reflection, [], ["models_info.json", "object 1"]),
+    "unreadable texture": (lambda i: _truncate(i / "photos" / "wall.jpg"), [], ["wall.jpg"]),
+    "empty texture": (lambda i: (i / "photos" / "wall.jpg").write_bytes(b""), [], ["wall.jpg"]),
+    "no textures": (lambda i: (i / "photos" / "wall.jpg").unlink(), [], ["photos"]),
+    "recipe typo": (
+        lambda i: (i / "recipe.yaml").write_text("camera: {distence_m: [1, 2]}\n"),
+        [],
+        ["recipe.yaml", "camera.distence_m", "did you mean camera.distance_m"],
+    ),
+    "min above max": (
+        lambda i: (i / "recipe.yaml").write_text("camera: {distance_m: [2, 1]}\n"),
+        [],
+        ["recipe.yaml", "camera.distance_m", "min 2", "max 1"],
+    ),
+    "no recipe": (lambda i: (i / "recipe.yaml").unlink(), [], ["recipe.yaml", "no such recipe"]),
+    "unknown object": (lambda i: None, ["--set", "objects.ids=[7]"], ["no mesh for object 7"]),
+    "no distractors": (
+        lambda i: None,
+        ["--set", "objects.distractors=[1, 2]"],
+        ["objects.distractors", "source.distractors"],
+    ),
+    "no images": (lambda i: None, ["--images", "0"], ["images", "0"]),
+    "no such option": (lambda i: None, ["--imagse", "3"], ["--imagse", "--images"]),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_INPUT)
+def test_bad_input_is_one_line_and_leaves_nothing(kind: str, inputs: Path, tmp_path: Path, run: Run) -> None:
+    damage, options, expected = BAD_INPUT[kind]
+    damage(inputs)
+    out = tmp_path / "out"
+    sources = ["--models", inputs / "models", "--textures", inputs / "photos"]
+    code, stdout, stderr = run("generate", inputs / "recipe.yaml", "--out", out, *sources, *options)
+    assert code == 2
+    assert stdout == ""
+    assert "Traceback" not in stderr
+    last = stderr.strip().splitlines()[-1]
+    for part in expected:
+        assert part in last, last
+    assert not out.exists()
+
+
+def test_a_foreign_folder_is_left_alone(inputs: Path, tmp_path: Path, run: Run) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "thesis.tex").write_text("dear")
+    code, _, stderr = run("generate", inputs / "recipe.yaml", "--out", out, "--models", inputs / "models")
+    assert code == 2
+    assert "thesis.tex" in stderr
+    assert [path.name for path in out.iterdir()] == ["thesis.tex"]
+
+
+def test_an_unwritable_folder_is_told(inputs: Path, tmp_path: Path, run: Run) -> None:
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file" / "out", Path("/proc/nothing")):
+        code, _, stderr = run("generate", inputs / "recipe.yaml", "--out", out, "--models", inputs / "models")
+        assert code == 2
+        assert str(out) in stderr
+        assert "Traceback" not in stderr
+
+
+def test_help_lists_every_setting(run: Run) -> None:
+    from synthetless.config import settings
+
+    code, stdout, _ = run("generate", "--help")
+    assert code == 0
+    for setting in settings():
+        assert setting.key in stdout
+
+
+def test_without_arguments_the_commands_are_listed(run: Run) -> None:
+    _, stdout, stderr = run()
+    assert "generate" in stdout + stderr
+    assert "render" in stdout + stderr
+
+
+def test_no_summary_of_a_command_is_cut(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    for group in ([], ["export"], ["symmetries"]):
+        code, out, _ = run(*group, "--help")
+        assert code == 0
+        commands = out.partition("Commands:")[2].splitlines()
+        assert len(commands) > 2
+        assert not [line for line in commands if line.rstrip().endswith(("...", "…"))]
+
+
+def test_help_fits_eighty_columns(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    for command in ("generate", "preview", "validate", "relabel", "adopt", "fetch", "doctor", "render", "redo"):
+        _, out, _ = run(command, "--help")
+        assert max(map(len, out.splitlines())) <= 80
+
+
+def test_the_version_is_told(run: Run) -> None:
+    assert run("--version")[:2] == (0, f"synthetless {version('synthetless')}\n")
+
+
+def test_requests_that_contradict_themselves(run: Run, inputs: Path, tmp_path: Path) -> None:
+    begin = ("generate", inputs / "recipe.yaml", "--models", inputs / "models", "--out", tmp_path / "out")
+    for options, expected in (
+        (["--address", "auto"], "--executor ray"),
+        (["--executor", "ray", "--dry-run"], "--dry-run"),
+        (["--device", "metal"], "--device metal"),
+        (["--part", "3/2"], "3/2"),
+    ):
+        code, _, err = run(*begin, *options)
+        assert code == 2
+        assert expected in err
+        assert len(err.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()

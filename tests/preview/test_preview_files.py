@@ -1,0 +1,179 @@
+"""What a preview writes, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from trees import contents
+
+from synthetless.dataset.labels import box_corners_mm
+from synthetless.io.files import read_bytes
+from synthetless.io.images import decode_mask, decode_rgb
+from synthetless.preview import overlays, write_preview
+from tests.preview.conftest import HOSTILE_NAME, images_of
+
+K = np.array([[300.0, 0, 63.2], [0, 298.0, 47.7], [0, 0, 1]])
+SEGMENT = 4
+
+
+def test_every_image_has_its_files_and_every_file_is_an_images(small_preview: Path, small_dataset: Path) -> None:
+    keys = [image.key for image in images_of(small_dataset)]
+    assert [key for key, _ in _index(small_preview)["images"]] == keys
+    folder = small_preview.parent
+    assert sorted(str(p.relative_to(folder)) for p in (folder / "thumbnails").rglob("*.jpg")) == [
+        f"thumbnails/{key}.jpg" for key in keys
+    ]
+    for key in keys:
+        detail = _detail(small_preview, key)
+        assert list(detail["views"]) == ["rgb", "depth", "normals"]
+        for view in detail["views"].values():
+            assert decode_rgb(read_bytes(folder / view)).shape == (96, 128, 3)
+
+
+def test_the_index_says_what_the_labels_say(small_preview: Path, small_dataset: Path) -> None:
+    for (_, flat), image in zip(_index(small_preview)["images"], images_of(small_dataset), strict=True):
+        expected = [
+            value
+            for label, info in zip(image.labels.gt_canonical, image.labels.gt_info, strict=True)
+            for value in (
+                label["obj_id"],
+                label["regressor_index"],
+                round(1000 * info["visib_fract"]),
+                round(10 * label["discontinuity_margin_deg"]),
+            )
+        ]
+        assert flat == expected
+
+
+def test_canonical_boxes_are_drawn_where_the_labels_put_their_corners(small_preview: Path, small_dataset: Path) -> None:
+    for image in images_of(small_dataset):
+        drawn = _detail(small_preview, image.key)["instances"]
+        for label, instance in zip(image.labels.gt_canonical, drawn, strict=True):
+            ends = np.array(instance["canonical"]["box"]).reshape(12, 2, 2)
+            corners = np.array(label["bbox3d_corners_2d"])
+            expected = np.array([[corners[a], corners[b]] for a, b in overlays.BOX_EDGES])
+            np.testing.assert_allclose(ends, expected, atol=0.051)
+
+
+def test_outlines_fill_what_the_masks_cover(small_preview: Path, small_dataset: Path) -> None:
+    for image in images_of(small_dataset):
+        for instance in _detail(small_preview, image.key)["instances"]:
+            path = image.scene.mask(image.labels.im_id, instance["gt"])
+            mask = decode_mask(read_bytes(path), path)
+            filled = _filled(instance["outlines"]["amodal"], mask.shape)
+            assert np.count_nonzero(filled != mask) <= 0.05 * mask.sum() + 5
+
+
+@given(hnp.arrays(np.bool_, st.tuples(st.integers(1, 24), st.integers(1, 24))))
+def test_outlines_stay_within_a_pixel_of_any_mask(mask: np.ndarray) -> None:
+    filled = _filled(overlays.outline(mask), mask.shape)
+    near = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    assert not (filled & ~near).any()
+    assert filled.any() == mask.any()
+
+
+@given(st.floats(-400, 400), st.integers(0, 2**32 - 1))
+def test_lines_stay_finite_and_before_the_camera(depth_mm: float, seed: int) -> None:
+    R = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    corners = box_corners_mm({f"min_{a}": -40 for a in "xyz"} | {f"size_{a}": 80 for a in "xyz"})
+    lines = overlays.box_lines(K, R, np.array([5.0, -3.0, depth_mm]), corners)
+    inside = (corners @ R.T + [5.0, -3.0, depth_mm])[:, 2] > 10
+    assert np.isfinite(lines).all() if lines else not inside.any()
+    assert len(lines) == sum(inside[a] or inside[b] for a, b in overlays.BOX_EDGES)
+    assert all(len(line) == SEGMENT for line in lines)
+
+
+def test_the_page_shows_a_hostile_name_as_text(small_preview: Path) -> None:
+    class Reader(HTMLParser):
+        scripts, heading, inside = 0, "", False
+
+        def handle_starttag(self, tag: str, attrs: object) -> None:
+            self.scripts += tag == "script"
+            self.inside = tag == "h1"
+
+        def handle_data(self, data: str) -> None:
+            if self.inside:
+                self.heading += data
+
+        def handle_endtag(self, tag: str) -> None:
+            self.inside = False
+
+    reader = Reader()
+    reader.feed(small_preview.read_text())
+    assert reader.heading == HOSTILE_NAME
+    assert reader.scripts == 4
+
+
+def test_nothing_is_taken_from_elsewhere(small_preview: Path) -> None:
+    for path in (p for p in small_preview.parent.rglob("*") if p.suffix in {".html", ".css", ".js"}):
+        addresses = set(re.findall(r"https?://[^\s\"'`]+", path.read_text())) - {"http://www.w3.org/2000/svg"}
+        assert not addresses, path
+
+
+def test_the_same_dataset_gives_the_same_bytes(small_preview: Path, small_dataset: Path, tmp_path: Path) -> None:
+    again = write_preview(small_dataset, tmp_path / "again")
+    assert contents(again.parent) == contents(small_preview.parent)
+
+
+def test_a_preview_is_replaced_and_nothing_else(small_dataset: Path, tmp_path: Path) -> None:
+    to = tmp_path / "pages"
+    write_preview(small_dataset, to, limit=4)
+    keys = [image.key for image in images_of(small_dataset)]
+    assert [key for key, _ in _index(to / "index.html")["images"]] == [keys[i] for i in (0, 1, 3, 4)]
+    write_preview(small_dataset, to, limit=1)
+    assert len(list((to / "thumbnails").rglob("*.jpg"))) == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["pages"]
+    letters = tmp_path / "letters"
+    letters.mkdir()
+    (letters / "index.html").write_text("my own page")
+    with pytest.raises(ValueError, match="is no preview"):
+        write_preview(small_dataset, letters)
+    assert (letters / "index.html").read_text() == "my own page"
+
+
+def test_a_damaged_dataset_leaves_the_former_preview(small_dataset: Path, tmp_path: Path) -> None:
+    to = tmp_path / "pages"
+    before = contents(write_preview(small_dataset, to, limit=2).parent)
+    last = images_of(small_dataset)[-1]
+    damaged = last.scene.depth(last.labels.im_id)
+    content = damaged.read_bytes()
+    damaged.write_bytes(content[:40])
+    try:
+        with pytest.raises(ValueError, match=re.escape(f"depth/{damaged.name}")):
+            write_preview(small_dataset, to)
+    finally:
+        damaged.write_bytes(content)
+    assert contents(to) == before
+
+
+def test_no_dataset_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no such dataset"):
+        write_preview(tmp_path / "nowhere")
+
+
+def _index(page: Path) -> dict[str, list]:
+    text = (page.parent / "data" / "index.js").read_text()
+    return json.loads(text.removeprefix("synthetless.index = ").removesuffix(";\n"))
+
+
+def _detail(page: Path, key: str) -> dict:
+    text = (page.parent / "data" / f"{key}.js").read_text()
+    return json.loads(text.split(", ", 1)[1].removesuffix(");\n"))
+
+
+def _filled(path: str, shape: tuple[int, ...]) -> np.ndarray:
+    """The pixels that a path covers or touches, by the even-odd rule."""
+    rings = [np.array(re.findall(r"(\d+) (\d+)", part), dtype=np.int32) for part in path.split("M") if part]
+    filled = np.zeros(shape, np.uint8)
+    if rings:
+        cv2.fillPoly(filled, rings, 1)
+    return filled.astype(bool)

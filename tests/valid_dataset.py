@@ -1,0 +1,198 @@
+"""A small valid dataset without Blender: objects laid on the table, measured by ray casting, noise for colours."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from synthetless.annotation.instances import ImageAnnotation, PosedModel
+from synthetless.annotation.raycast import Occluder, Plane, RayCaster
+from synthetless.config import Recipe, load_recipe
+from synthetless.dataset import records
+from synthetless.dataset.layout import ImagePlan, ScenePaths, by_drop, scene_ids
+from synthetless.dataset.store import Dataset, FinishedImage
+from synthetless.generation.drop import encode
+from synthetless.generation.rerender import read_recipe
+from synthetless.io.images import has_depth
+from synthetless.io.models import ObjectModel, load_models
+from synthetless.scenes.camera import extrinsics
+from synthetless.scenes.render import centre
+from synthetless.scenes.rotations import matrix
+from synthetless.scenes.sampling import Catalogue, sample_scene
+from synthetless.scenes.spec import Pose, SceneSpec
+
+IMAGES, IMAGES_PER_SCENE = 6, 3
+RECIPE = (
+    f"images={IMAGES}",
+    "camera.width=128",
+    "camera.height=96",
+    "camera.fx=300",
+    "camera.fy=298",
+    "camera.cx=63.2",
+    "camera.cy=47.7",
+    "camera.distance_m=[0.35, 0.5]",
+    "camera.elevation_deg=[35, 80]",
+    "camera.views_per_drop=2",
+    "objects.count=[4, 6]",
+    "labels.visibility_delta_mm=0",
+    "source.licence=CC0 1.0, made for the tests",
+)
+TURNS = {1: [], 2: [np.diag([1, -1, -1])], 3: [np.diag([-1, -1, 1])]}
+
+
+def write_models(folder: Path) -> Path:
+    """An angle without symmetries, a cylinder (O(2)) and a box that is declared C2."""
+    folder.mkdir(parents=True)
+    foot = trimesh.creation.box((50, 20, 10))
+    arm = trimesh.creation.box((12, 16, 30)).apply_translation((-19, 2, 20))
+    meshes = {
+        1: trimesh.util.concatenate([foot, arm]),
+        2: trimesh.creation.cylinder(radius=16, height=42, sections=48),
+        3: trimesh.creation.box((44, 30, 18)),
+    }
+    infos: dict[str, Any] = {}
+    for obj_id, mesh in meshes.items():
+        mesh.export(folder / f"obj_{obj_id:06d}.ply")
+        corners = mesh.vertices.astype(np.float32).astype(np.float64)  # as the file has them
+        info: dict[str, Any] = {"diameter": float(max(np.linalg.norm(a - corners, axis=1).max() for a in corners))}
+        for axis, low, size in zip("xyz", corners.min(axis=0), np.ptp(corners, axis=0), strict=True):
+            info |= {f"min_{axis}": float(low), f"size_{axis}": float(size)}
+        if TURNS[obj_id]:
+            motions = [np.block([[R, np.zeros((3, 1))], [np.eye(4)[3:]]]) for R in TURNS[obj_id]]
+            info["symmetries_discrete"] = [motion.ravel().tolist() for motion in motions]
+        if obj_id == 2:
+            info["symmetries_continuous"] = [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]
+        infos[str(obj_id)] = info
+    (folder / "models_info.json").write_text(json.dumps(infos))
+    return folder
+
+
+def write_distractors(folder: Path) -> Path:
+    """One ball."""
+    folder.mkdir(parents=True)
+    trimesh.creation.icosphere(subdivisions=2, radius=14).export(folder / "obj_000001.ply")
+    box = {f"min_{axis}": -14.0 for axis in "xyz"} | {f"size_{axis}": 28.0 for axis in "xyz"}
+    (folder / "models_info.json").write_text(json.dumps({"1": {"diameter": 28.0, **box}}))
+    return folder
+
+
+@contextmanager
+def small_scene_folders() -> Iterator[None]:
+    """Plan so few images a scene folder that a few fill several."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("synthetless.dataset.layout.IMAGES_PER_SCENE", IMAGES_PER_SCENE)
+        yield
+
+
+@small_scene_folders()
+def write_dataset(root: Path, models_folder: Path, overrides: Sequence[str] = (), seed: int = 5) -> Dataset:
+    """A complete dataset of random colours and true everything else."""
+    recipe = load_recipe(None, [*RECIPE, f"seed={seed}", *overrides])
+    maker = _Maker(recipe, load_models(models_folder))
+    dataset = Dataset.open(root, recipe, maker.models, "")
+    for drop, plans in by_drop(range(recipe.images), recipe.camera.views_per_drop):
+        for image in maker.make(drop, plans):
+            dataset.commit(image)
+    dataset.assemble()
+    return dataset
+
+
+def ray_cast(root: Path, models_folder: Path) -> dict[tuple[int, int], ImageAnnotation]:
+    """What ray casting says of each image, by scene folder and image id, from its camera and poses."""
+    models = load_models(models_folder)
+    caster = RayCaster({obj_id: (model.vertices_mm, model.faces) for obj_id, model in models.items()})
+    recipe = read_recipe(root)
+    seen = {}
+    for scene_id in scene_ids(root):
+        scene = ScenePaths.of(root, scene_id)
+        cameras = records.read_scene_json(scene.scene_camera)
+        for im_id, gt in records.read_scene_json(scene.scene_gt).items():
+            R_w2c, t_w2c = np.reshape(cameras[im_id]["cam_R_w2c"], (3, 3)), np.array(cameras[im_id]["cam_t_w2c"])
+            posed = [
+                PosedModel(pose["obj_id"], np.reshape(pose["cam_R_m2c"], (3, 3)), np.array(pose["cam_t_m2c"]))
+                for pose in gt
+            ]
+            table = Plane(R_w2c, t_w2c, 500 * recipe.table.size_m)
+            seen[scene_id, im_id] = caster.annotate(recipe.intrinsics, table, posed)
+    return seen
+
+
+class _Maker:
+    """Does what a studio does, with a draw in place of physics and noise in place of the renderer."""
+
+    def __init__(self, recipe: Recipe, models: Mapping[int, ObjectModel]) -> None:
+        self._recipe, self.models = recipe, models
+        distractors: Mapping[int, ObjectModel] = {}
+        if recipe.source.distractors is not None:
+            distractors = load_models(Path(recipe.source.distractors))
+        self._of_role = {"model": models, "distractor": distractors}
+        meshes = {self._key(role, i): m for role, of in self._of_role.items() for i, m in of.items()}
+        self._caster = RayCaster({key: (model.vertices_mm, model.faces) for key, model in meshes.items()})
+
+    def make(self, drop: int, plans: Sequence[ImagePlan]) -> list[FinishedImage]:
+        models, distractors = ({i: m.diameter_mm / 1000 for i, m in of.items()} for of in self._of_role.values())
+        spec = sample_scene(self._recipe, Catalogue(models, distractors), self._recipe.seed, drop)
+        settled = self._lay_down(spec, np.random.default_rng([self._recipe.seed, drop]))
+        return [self._image(plan, spec, settled) for plan in plans]
+
+    def _lay_down(self, spec: SceneSpec, rng: np.random.Generator) -> tuple[Pose, ...]:
+        """Anywhere, in any pose that touches the table."""
+        poses = []
+        for item in spec.objects:
+            x, y, z, w = Rotation.random(random_state=rng).as_quat()
+            wxyz = (float(w), float(x), float(y), float(z))
+            low = (self._of_role[item.role][item.obj_id].vertices_mm @ matrix(wxyz)[2]).min()
+            u, v = rng.uniform(-0.07, 0.07, 2)
+            poses.append(Pose(wxyz, (float(u), float(v), float(-low / 1000))))
+        return tuple(poses)
+
+    def _image(self, plan: ImagePlan, spec: SceneSpec, settled: tuple[Pose, ...]) -> FinishedImage:
+        recipe, camera = self._recipe, self._recipe.intrinsics
+        R_w2c, t_w2c_m = extrinsics(spec.views[plan.view], centre(settled))
+        t_w2c = 1000 * t_w2c_m
+        poses = [(R_w2c @ matrix(p.rotation_wxyz), R_w2c @ (1000 * np.array(p.position_m)) + t_w2c) for p in settled]
+        items = list(enumerate(zip(spec.objects, poses, strict=True)))
+        models = {n: PosedModel(item.obj_id, *pose) for n, (item, pose) in items if item.role == "model"}
+        balls = [
+            Occluder(self._key(item.role, item.obj_id), *pose) for _, (item, pose) in items if item.role != "model"
+        ]
+        plane = Plane(R_w2c, t_w2c, recipe.table.size_m * 500)
+        delta, outputs = recipe.labels.visibility_delta_mm, recipe.outputs
+        extra = "normals" in outputs, "object_coordinates" in outputs
+        seen = self._caster.annotate(camera, plane, list(models.values()), balls, delta, *extra)
+        shown = [n for n, instance in zip(models, seen.instances, strict=True) if instance.mask.any()]
+        seen = self._caster.annotate(camera, plane, [models[n] for n in shown], balls, delta, *extra)
+        if "depth" in outputs:
+            seen = seen.where_valid(has_depth(seen.depth_mm, recipe.encoding.depth_scale))
+        rng = np.random.default_rng([plan.number, 1])
+        rgb = rng.integers(0, 256, (camera.height, camera.width, 3), dtype=np.uint8)
+        return FinishedImage(
+            plan,
+            encode(recipe, plan, seen, rgb, (rgb / 255).astype(np.float32)),
+            records.camera_entry(records.camera_matrix(camera), R_w2c, t_w2c, recipe.encoding.depth_scale),
+            [records.gt_entry(models[n].obj_id, models[n].R_m2c, models[n].t_m2c) for n in shown],
+            [records.gt_info_entry(instance) for instance in seen.instances],
+            records.coco_annotations(plan.im_id, [models[n].obj_id for n in shown], seen.instances),
+            {
+                "image_id": plan.im_id,
+                "view": plan.view,
+                "exposure_gain": math.sqrt(2),
+                "instances": shown,
+                "scene": asdict(spec),
+                "settled": [asdict(pose) for pose in settled],
+            },
+        )
+
+    @staticmethod
+    def _key(role: str, obj_id: int) -> Any:
+        return obj_id if role == "model" else (role, obj_id)
