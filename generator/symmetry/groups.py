@@ -17,9 +17,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from synthetless.errors import UserError
-from synthetless.symmetry.frames import frame_of_axes, frame_of_axis, signed_axis
 from synthetless.symmetry.from_bop import recognise
-from synthetless.symmetry.point_groups import Family, GroupName, X, Z, parse_name, standard_elements
+from synthetless.symmetry.point_groups import (
+    Family,
+    GroupName,
+    X,
+    Z,
+    frame_of_axes,
+    frame_of_axis,
+    parse_name,
+    signed_axis,
+    standard_elements,
+)
 from synthetless.symmetry.quaternions import (
     IDENTITY,
     Floats,

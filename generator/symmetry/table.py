@@ -35,6 +35,9 @@ from synthetless.symmetry.groups import SymmetryGroup
 
 Matrix = tuple[tuple[float, ...], ...]
 
+TABLE_FILE = "symmetries.json"
+MODELS_INFO_FILE = "models_info.json"
+
 _TABLE_KEYS = ("scheme", "allocentric", "objects")
 _GIVEN_KEYS = ("group", "axis", "secondary_axis", "frame", "offset", "offset_mm", "reference_rotation")
 _DERIVED_KEYS = ("order", "n_regressors", "anchors", "separation_deg")
@@ -80,14 +83,14 @@ class SymmetryTable:
         object.__setattr__(self, "entries", MappingProxyType(ordered))
 
     @classmethod
-    def from_models_info(
-        cls, models_info: Mapping[Any, Mapping[str, Any]], scheme: Scheme = "pitteri2019", allocentric: bool = False
-    ) -> Self:
+    def from_models_info(cls, models_info: object, scheme: Scheme = "pitteri2019", allocentric: bool = False) -> Self:
         """The table of the groups that BOP's `models_info.json` declares (keys: object ids as int or str).
 
         Raises:
             UserError: an entry that describes no rotation group, with the object's id.
         """
+        if not isinstance(models_info, Mapping):
+            raise UserError("models_info.json maps object ids to their diameters, boxes and symmetries")
         entries = {}
         for key, info in models_info.items():
             obj_id = _object_id(key)
@@ -132,17 +135,21 @@ class SymmetryTable:
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """The table in a YAML or JSON file.
+        """The table in a YAML or JSON file, in BOP's `models_info.json`, or in a folder that holds one of these.
+
+        Of a folder `symmetries.json` is taken, or else `models_info.json`.
 
         Raises:
-            UserError: the file cannot be read, is neither JSON nor YAML, or what `from_dict` refuses; with the file's
-                name.
+            UserError: the file cannot be found or read, is neither JSON nor YAML, or what `from_dict` refuses; with
+                the file's name.
         """
-        data = read_bytes(Path(path))
+        file = _file_of(Path(path))
+        data = read_bytes(file)
         try:
-            return cls.from_dict(_parsed(data.decode()))
+            content = _parsed(data.decode())
+            return cls.from_models_info(content) if file.name == MODELS_INFO_FILE else cls.from_dict(content)
         except ValueError as error:
-            raise UserError(f"{path}: {error}") from error
+            raise UserError(f"{file}: {error}") from error
 
     def write(self, path: str | Path) -> None:
         """Write the table as JSON (which is YAML as well), always the same bytes, whole or not at all.
@@ -268,6 +275,17 @@ def _refuse_unknown(mapping: Mapping[Any, Any], known: Iterable[str], where: str
 def _suggestion(word: str, known: Iterable[str]) -> str:
     nearest = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
     return f": did you mean {nearest[0]!r}?" if nearest else ""
+
+
+def _file_of(path: Path) -> Path:
+    if not path.is_dir():
+        return path
+    found = [path / name for name in (TABLE_FILE, MODELS_INFO_FILE) if (path / name).exists()]
+    if not found:
+        raise UserError(
+            f"{path}: holds neither {TABLE_FILE} nor {MODELS_INFO_FILE}; symmetries detect can write a table"
+        )
+    return found[0]
 
 
 def _check_scheme(scheme: object) -> None:
