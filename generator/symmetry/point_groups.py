@@ -7,6 +7,7 @@ x, y and z and a 3-fold axis along (1, 1, 1); I has a 5-fold axis along (0, 1, (
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from typing import Literal, NamedTuple
 
@@ -36,6 +37,16 @@ class GroupName(NamedTuple):
 
     family: Family
     n: int
+
+    @property
+    def text(self) -> str:
+        """The name as it is written."""
+        return f"{self.family}{self.n}" if self.n else self.family
+
+    @property
+    def order(self) -> float:
+        """The number of elements, `math.inf` of a continuous group."""
+        return {"C": self.n, "D": 2 * self.n, "T": 12, "O": 24, "I": 60}.get(self.family, math.inf)
 
 
 def parse_name(name: object) -> GroupName:
