@@ -40,6 +40,7 @@ from synthetless.dataset.layout import (
     find_models_folder,
     scene_folders,
 )
+from synthetless.dataset.reader import read_recipe
 from synthetless.dataset.records import CanonicalEntry, GtEntry, ModelInfo, read_scene_json
 from synthetless.errors import UserError
 from synthetless.io.files import atomic_write, json_bytes, locked, read_bytes, read_json, replace_file, write_json
@@ -185,6 +186,7 @@ def relabel(
         if dry_run:
             refuse_half_labelled(root)
         header = read_json(root / DATASET_FILE)
+        read_recipe(root)  # what describes the dataset afterwards must be readable before
         state = LabelState.read(root, header)
         models_info = read_models_info(root / MODELS_FOLDER)
         after = revised(state.table, symmetries, scheme, models_info)
