@@ -17,7 +17,7 @@ from pathlib import Path
 from benchmarks import keep, parser, tless_recipe
 from synthetless.config import Recipe
 from synthetless.dataset.layout import plan_image
-from synthetless.dataset.store import Dataset
+from synthetless.dataset.store import DatasetStore
 from synthetless.generation import devices
 from synthetless.generation.drop import Studio
 from synthetless.generation.sources import load_sources
@@ -27,7 +27,7 @@ STAGES = {
     "physics": [("physics.py", "settle"), ("studio.py", "_collider")],
     "build": [("render.py", "scene")],
     "annotate": [("raycast.py", "annotate")],
-    "develop": [("develop.py", "exposure_gain"), ("develop.py", "develop")],
+    "develop": [("color.py", "exposure_gain"), ("color.py", "tonemap")],
     "encode": [("studio.py", "encode")],
     "commit": [("dataset.py", "commit")],
 }
@@ -63,7 +63,7 @@ def measure(recipe: Recipe, images: int, wanted: str) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "blender.log"
         sources = load_sources(recipe)
-        dataset = Dataset.open(Path(folder) / "dataset", recipe, sources.models, sources.scenery_digest)
+        dataset = DatasetStore.open(Path(folder) / "dataset", recipe, sources.models, sources.scenery_digest)
         began = time.perf_counter()
         studio = Studio(recipe, sources, 1, devices.take(devices.choose(wanted)), log)
         stages = {"start": time.perf_counter() - began}

@@ -18,7 +18,7 @@ from pebble import ProcessExpired, ProcessPool
 
 from synthetless.config import Recipe
 from synthetless.dataset.layout import LOGS_FOLDER, ImagePlan
-from synthetless.dataset.store import Dataset, DatasetError
+from synthetless.dataset.store import DatasetError, DatasetStore
 from synthetless.generation import devices
 from synthetless.generation.devices import CPU, Devices
 from synthetless.generation.drop import DropFailed, Studio
@@ -133,7 +133,7 @@ def _outcome(future: Future[Outcome], job: Job, place: Workplace) -> Outcome | N
 def _make(place: Workplace, job: Job) -> Outcome:
     """In the worker: make and commit the images of one drop."""
     inject_fault(job.drop)
-    dataset, studio = Dataset(place.root, place.recipe), _studio(place)
+    dataset, studio = DatasetStore(place.root, place.recipe), _studio(place)
     if psutil.Process().memory_info().rss > _memory_at_start(place) + GROWTH_LIMIT_BYTES:
         os._exit(_RENEW)
     made = 0

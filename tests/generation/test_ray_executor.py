@@ -26,7 +26,7 @@ from trees import data_files
 
 from synthetless.config import Recipe, load_recipe
 from synthetless.dataset.layout import LOGS_FOLDER, by_drop
-from synthetless.dataset.store import Dataset, versions
+from synthetless.dataset.store import DatasetStore, versions
 from synthetless.generation import cluster, executors
 from synthetless.generation.cluster import connection, crew
 from synthetless.generation.cluster.connection import needs_of, room_for
@@ -85,7 +85,7 @@ def two_nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 def _make(root: Path, recipe: Recipe, execute: Execute, drop_limit_s: float = 300.0) -> list[Outcome]:
     """What generate does, with this executor."""
     sources = load_sources(recipe)
-    dataset = Dataset.open(root, recipe, sources.models, sources.scenery_digest)
+    dataset = DatasetStore.open(root, recipe, sources.models, sources.scenery_digest)
     jobs = [Job(drop, tuple(images)) for drop, images in by_drop(dataset.missing(), recipe.camera.views_per_drop)]
     outcomes = list(execute(jobs, Workplace(recipe, root, threads=1, drop_limit_s=drop_limit_s)))
     dataset.finish()

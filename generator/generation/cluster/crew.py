@@ -17,7 +17,7 @@ from typing import Any
 from uuid import uuid4
 
 from synthetless.dataset.layout import LOGS_FOLDER
-from synthetless.dataset.store import Dataset
+from synthetless.dataset.store import DatasetStore
 from synthetless.errors import UserError
 from synthetless.generation.cluster.connection import Node, connected, in_words, living_nodes, needs_of, room_for
 from synthetless.generation.cluster.worker import Delivery, Desk, Supplies, Worker
@@ -91,7 +91,7 @@ class _Crew:
     def __init__(self, ray: Any, place: Workplace, sources: Sources, token: Path, workers: int | None) -> None:
         self._ray = ray
         self._sources = sources
-        self._dataset = Dataset(place.root, place.recipe)
+        self._dataset = DatasetStore(place.root, place.recipe)
         self._wanted = workers
         self._nodes, self._looked = living_nodes(ray), time.monotonic()
         self._needs = needs_of(place, self._nodes)

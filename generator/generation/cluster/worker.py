@@ -13,7 +13,7 @@ from pathlib import Path
 import psutil
 
 from synthetless.dataset.layout import LOGS_FOLDER
-from synthetless.dataset.store import Dataset, DatasetError, FinishedImage, versions
+from synthetless.dataset.store import DatasetError, DatasetStore, FinishedImage, versions
 from synthetless.errors import UserError
 from synthetless.generation.devices import take_assigned
 from synthetless.generation.drop import DropFailed, Studio
@@ -91,7 +91,7 @@ class Worker:
         os.environ[FAULT_VARIABLE] = faults
         self._place = place
         shares_folder = os.access(token, os.W_OK)
-        self._dataset = Dataset(place.root, place.recipe) if shares_folder else None
+        self._dataset = DatasetStore(place.root, place.recipe) if shares_folder else None
         name = f"worker-{platform.node()}-{os.getpid()}.log"
         # Ray keeps what its workers print, in a file for each of them.
         self._log = place.root / LOGS_FOLDER / name if shares_folder else Path("/dev/stdout")
