@@ -29,9 +29,10 @@ import yaml
 
 from synthetless.errors import UserError
 from synthetless.io.files import atomic_write, read_bytes
-from synthetless.symmetry.atlas import SCHEMES, Scheme
+from synthetless.symmetry.atlas import SCHEMES, Scheme, former_anchors
 from synthetless.symmetry.canonical import CanonicalMap
 from synthetless.symmetry.groups import SymmetryGroup
+from synthetless.symmetry.point_groups import parse_name
 
 Matrix = tuple[tuple[float, ...], ...]
 
@@ -256,7 +257,7 @@ def _entry(value: object, scheme: Scheme, what: str) -> SymmetryEntry:
         frame=value.get("frame"),
     )
     entry = SymmetryEntry(group, _reference(value.get("reference_rotation")))
-    _check_derived(value, _derived(entry, scheme))
+    _check_derived(value, entry, scheme)
     return entry
 
 
@@ -274,11 +275,21 @@ def _reference(value: object) -> Matrix | None:
     return tuple(tuple(float(number) for number in row) for row in rows)
 
 
-def _check_derived(given: Mapping[Any, Any], expected: Mapping[str, Any]) -> None:
+def _check_derived(given: Mapping[Any, Any], entry: SymmetryEntry, scheme: Scheme) -> None:
     """A file whose group was edited must not keep saying what followed from the former one."""
-    for key in _DERIVED_KEYS:
-        if key in given and not _agree(given[key], expected[key]):
-            raise UserError(f"{key} does not follow from the group and scheme: leave {', '.join(_DERIVED_KEYS)} out")
+    expected = _derived(entry, scheme)
+    wrong = [key for key in _DERIVED_KEYS if key in given and not _agree(given[key], expected[key])]
+    if wrong and not _is_of_earlier_version(given, wrong, entry, scheme):
+        raise UserError(f"{wrong[0]} does not follow from the group and scheme: leave {', '.join(_DERIVED_KEYS)} out")
+
+
+def _is_of_earlier_version(given: Mapping[Any, Any], wrong: list[str], entry: SymmetryEntry, scheme: Scheme) -> bool:
+    """Whether the file was right when it was written: its group stands, only its labels have to be made again."""
+    if scheme != "pitteri2019" or not {"anchors"} <= set(wrong) <= {"anchors", "separation_deg"}:
+        return False
+    return _agree(
+        given["anchors"], entry.canonical_map(scheme).placed_wxyz(former_anchors(parse_name(entry.group.name)))
+    )
 
 
 def _agree(a: object, b: object) -> bool:

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from symmetry_cases import ALL, SCHEMES, in_random_frame, random_rotations, seeds
 
 from synthetless.symmetry import SymmetryEntry, SymmetryGroup, SymmetryTable
+from synthetless.symmetry.quaternions import from_matrix, multiply, to_matrix
 
 BY_HAND = """
 object 26: {group: C2, axis: [0, 0, 1], offset: [-7, 0, 0]}
@@ -86,6 +87,24 @@ def test_digests_tell_tables_apart() -> None:
     tables = [table("C2"), table("C3"), table("C2", "atlas"), table("C2", allocentric=True)]
     assert len({t.digest() for t in tables}) == 4
     assert table("C2").digest() == tables[0].digest()
+
+
+@pytest.mark.parametrize("name", ["D2", "D3"])
+def test_a_table_of_an_earlier_version_is_read_and_has_another_digest(name: str, tmp_path: Path) -> None:
+    """Its D_n had the fourth anchor of `pitteri2019` in another class: the labels are stale, the groups are right."""
+    group = in_random_frame(name, np.random.default_rng(0))
+    table = SymmetryTable({5: SymmetryEntry(group)})
+    former = table.to_dict()
+    anchors = from_matrix(to_matrix(np.array(former["objects"]["5"]["anchors"])))
+    anchors[3] = multiply(anchors[2], anchors[1])
+    former["objects"]["5"] |= {"anchors": anchors.tolist(), "separation_deg": 0.0}
+    path = tmp_path / "symmetries.json"
+    path.write_text(json.dumps(former))
+    assert SymmetryTable.read(path) == table
+    former["objects"]["5"]["anchors"][3] = anchors[2].tolist()
+    path.write_text(json.dumps(former))
+    with pytest.raises(ValueError, match="anchors does not follow"):
+        SymmetryTable.read(path)
 
 
 def test_tless_models_info_is_a_table_too(tless_models: Path) -> None:
