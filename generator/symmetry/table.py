@@ -6,9 +6,9 @@ By hand (YAML or JSON):
     object 27: {group: C4}
     object 31: {group: D3, axis: [0, 0, 1], secondary_axis: [1, 0, 0]}
 
-As `symmetries.json` beside a dataset: {"scheme", "allocentric", "objects": {id: entry}}, where an entry also says what
-follows from the group: order ("inf" for a continuous one), n_regressors, anchors (unit quaternions wxyz, in the role of
-`R_m2c`), separation_deg.
+As `symmetries.json` beside a dataset: {"scheme", "allocentric", "objects": {id: entry}}, and "decimals" if the poses
+that are labelled were rounded to less than 15 of them. An entry also says what follows from the group: order ("inf" for
+a continuous one), n_regressors, anchors (unit quaternions wxyz, in the role of `R_m2c`), separation_deg.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import yaml
 from synthetless.errors import UserError
 from synthetless.io.files import atomic_write, read_bytes
 from synthetless.symmetry.atlas import SCHEMES, Scheme, former_anchors
-from synthetless.symmetry.canonical import CanonicalMap
+from synthetless.symmetry.canonical import FULL_DECIMALS, CanonicalMap, check_decimals
 from synthetless.symmetry.groups import SymmetryGroup
 from synthetless.symmetry.point_groups import parse_name
 
@@ -39,7 +39,8 @@ Matrix = tuple[tuple[float, ...], ...]
 TABLE_FILE = "symmetries.json"
 MODELS_INFO_FILE = "models_info.json"
 
-_TABLE_KEYS = ("scheme", "allocentric", "objects")
+TABLE_KEYS = ("scheme", "allocentric", "decimals", "objects")
+
 _GIVEN_KEYS = ("group", "axis", "secondary_axis", "frame", "offset", "offset_mm", "reference_rotation")
 _DERIVED_KEYS = ("order", "n_regressors", "anchors", "separation_deg")
 _BOP_SIZES = tuple(f"{what}_{axis}" for what in ("min", "max", "size") for axis in "xyz")
@@ -59,7 +60,7 @@ class SymmetryEntry:
     group: SymmetryGroup
     reference_rotation: Matrix | None = None
 
-    def canonical_map(self, scheme: Scheme, allocentric: bool = False, decimals: int = 9) -> CanonicalMap:
+    def canonical_map(self, scheme: Scheme, allocentric: bool = False, decimals: int = FULL_DECIMALS) -> CanonicalMap:
         """The map that labels this object's poses."""
         return CanonicalMap(self.group, scheme, self.reference_rotation, allocentric, decimals)
 
@@ -72,13 +73,16 @@ class SymmetryTable:
         entries: by object id, ascending.
         scheme: `pitteri2019` or `atlas`.
         allocentric: whether rotations are judged relative to the ray to the object (see `CanonicalMap`).
+        decimals: with how many the poses that are labelled are stored (see `CanonicalMap`).
     """
 
     entries: Mapping[int, SymmetryEntry]
     scheme: Scheme = "pitteri2019"
     allocentric: bool = False
+    decimals: int = FULL_DECIMALS
 
     def __post_init__(self) -> None:
+        check_decimals(self.decimals)
         _check_scheme(self.scheme)
         ordered = {obj_id: self.entries[obj_id] for obj_id in sorted(self.entries)}
         object.__setattr__(self, "entries", MappingProxyType(ordered))
@@ -138,9 +142,9 @@ class SymmetryTable:
             raise UserError(
                 "a symmetry table is a mapping of objects, such as 'object 26: {group: C2, axis: [0, 0, 1]}'"
             )
-        objects = data.get("objects", {key: value for key, value in data.items() if key not in _TABLE_KEYS})
+        objects = data.get("objects", {key: value for key, value in data.items() if key not in TABLE_KEYS})
         if "objects" in data:
-            _refuse_unknown(data, _TABLE_KEYS, "the symmetry table")
+            _refuse_unknown(data, TABLE_KEYS, "the symmetry table")
         scheme, allocentric = data.get("scheme", SCHEMES[0]), data.get("allocentric", False)
         _check_scheme(scheme)
         if not isinstance(allocentric, bool):
@@ -151,7 +155,7 @@ class SymmetryTable:
                 entries[obj_id] = _entry(value, scheme, f"object {obj_id}")
             except UserError as error:
                 raise UserError(f"object {obj_id}: {error}") from error
-        return cls(entries, scheme, allocentric)
+        return cls(entries, scheme, allocentric, data.get("decimals", FULL_DECIMALS))
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
@@ -177,21 +181,25 @@ class SymmetryTable:
         Raises:
             UserError: the file cannot be written.
         """
-        head = [f'"scheme": {json.dumps(self.scheme)}', f'"allocentric": {json.dumps(self.allocentric)}']
-        lines = [f"  {json.dumps(key)}: {json.dumps(entry)}" for key, entry in self.to_dict()["objects"].items()]
+        content = self.to_dict()
+        head = [f'"{key}": {json.dumps(content[key])}' for key in content if key != "objects"]
+        lines = [f"  {json.dumps(key)}: {json.dumps(entry)}" for key, entry in content["objects"].items()]
         text = "{\n" + ",\n".join(head) + ',\n"objects": {\n' + ",\n".join(lines) + "\n}}\n"
         atomic_write(Path(path), text.encode(), durable=True)
 
     def to_dict(self) -> dict[str, Any]:
         """What `write` writes: plain dicts, lists and numbers."""
         objects = {str(obj_id): self._described(entry) for obj_id, entry in self.entries.items()}
-        return {"scheme": self.scheme, "allocentric": self.allocentric, "objects": objects}
+        head: dict[str, Any] = {"scheme": self.scheme, "allocentric": self.allocentric}
+        if self.decimals < FULL_DECIMALS:
+            head["decimals"] = self.decimals
+        return head | {"objects": objects}
 
     def digest(self) -> str:
         """SHA-256 (hex) of the table's canonical JSON: equal digests, equal labels."""
         return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
 
-    def canonical_map(self, obj_id: int, decimals: int = 9) -> CanonicalMap:
+    def canonical_map(self, obj_id: int) -> CanonicalMap:
         """The map that labels an object's poses.
 
         Raises:
@@ -199,7 +207,7 @@ class SymmetryTable:
         """
         if obj_id not in self.entries:
             raise UserError(f"object {obj_id} is not in the symmetry table, which has {_listed(self.entries)}")
-        return self.entries[obj_id].canonical_map(self.scheme, self.allocentric, decimals)
+        return self.entries[obj_id].canonical_map(self.scheme, self.allocentric, self.decimals)
 
     def _described(self, entry: SymmetryEntry) -> dict[str, Any]:
         group = entry.group
@@ -305,7 +313,7 @@ def _agree(a: object, b: object) -> bool:
 def _object_id(key: object) -> int:
     matched = _OBJECT_KEY.fullmatch(str(key).strip())
     if matched is None:
-        raise UserError(f"{key!r} names no object: write 'object 26' or 26{_suggestion(str(key), _TABLE_KEYS)}")
+        raise UserError(f"{key!r} names no object: write 'object 26' or 26{_suggestion(str(key), TABLE_KEYS)}")
     return int(matched[1])
 
 

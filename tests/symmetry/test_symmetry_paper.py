@@ -104,7 +104,7 @@ def test_with_the_product_in_the_other_order_a_third_of_the_indices_would_differ
     group = SymmetryGroup.from_name(f"D{order}")
     R = random_rotations(np.random.default_rng(0), 1500)
     index = CanonicalMap(group).regressor_index(R, np.zeros((len(R), 3)))
-    former = FiniteCharts(group.elements_wxyz, former_anchors(parse_name(group.name)), "nearest", Z, 1e-6)
+    former = FiniteCharts(group.elements_wxyz, former_anchors(parse_name(group.name)), "nearest", Z, 1e-6, 0.0)
     assert 440 < (former.label(from_matrix(R)).chart != index).sum() < 620
 
 
