@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +23,13 @@ from synthetless.dataset.layout import ImagePlan, ScenePaths
 from synthetless.dataset.store import FinishedImage
 from synthetless.generation.sources import Sources
 from synthetless.io import images
+from synthetless.io.cache import Cache, digest
 from synthetless.io.color import develop, exposure_gain
 from synthetless.io.images import encode_exr
 from synthetless.io.models import ObjectModel
 from synthetless.scenes.blender import CPU, RenderDevice
-from synthetless.scenes.physics import Collider, NotSettled, PhysicsSettings, collider, settle
+from synthetless.scenes.collider import VERSION, Collider, collider
+from synthetless.scenes.physics import NotSettled, PhysicsSettings, settle
 from synthetless.scenes.render import BlenderScene, BlenderSession
 from synthetless.scenes.rotations import matrix
 from synthetless.scenes.sampling import sample_scene
@@ -71,6 +74,7 @@ class DropRenderer:
         self._intrinsics = recipe.intrinsics
         self._meshes = {key: Mesh(model.vertices_mm / _MM, model.faces) for key, model in models.items()}
         self._colliders: dict[ModelKey, Collider] = {}
+        self._cache = Cache.default()
         self._caster = RayCaster({_caster_key(*key): (model.vertices_mm, model.faces) for key, model in models.items()})
         self.session = BlenderSession(
             self._meshes,
@@ -121,7 +125,9 @@ class DropRenderer:
 
     def _collider(self, key: ModelKey) -> Collider:
         if key not in self._colliders:
-            self._colliders[key] = collider(self._meshes[key])
+            mesh = self._meshes[key]
+            content = digest(mesh.vertices_m, mesh.faces)
+            self._colliders[key] = collider(mesh, partial(self._cache.arrays, "collider", content, VERSION))
         return self._colliders[key]
 
     def _image(self, plan: ImagePlan, scene: BlenderScene, settled: Sequence[Pose]) -> FinishedImage:
