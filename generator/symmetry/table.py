@@ -17,18 +17,17 @@ import difflib
 import hashlib
 import json
 import re
-from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
-import yaml
 
 from synthetless.errors import UserError
-from synthetless.io.files import atomic_write, read_bytes
+from synthetless.io.documents import read_document, shown
+from synthetless.io.files import atomic_write
 from synthetless.symmetry.atlas import SCHEMES, Scheme, former_anchors
 from synthetless.symmetry.canonical import FULL_DECIMALS, CanonicalMap, check_decimals
 from synthetless.symmetry.groups import SymmetryGroup
@@ -148,9 +147,10 @@ class SymmetryTable:
         scheme, allocentric = data.get("scheme", SCHEMES[0]), data.get("allocentric", False)
         _check_scheme(scheme)
         if not isinstance(allocentric, bool):
-            raise UserError(f"allocentric is {allocentric!r}, not true or false")
+            raise UserError(f"allocentric is {shown(allocentric)}, not true or false")
         entries = {}
-        for obj_id, value in _by_id(objects, f"objects is {objects!r}, not a mapping of object ids to groups").items():
+        by_id = _by_id(objects, f"objects is {shown(objects)}, not a mapping of object ids to groups")
+        for obj_id, value in by_id.items():
             try:
                 entries[obj_id] = _entry(value, scheme, f"object {obj_id}")
             except UserError as error:
@@ -168,11 +168,10 @@ class SymmetryTable:
                 the file's name.
         """
         file = _file_of(Path(path))
-        data = read_bytes(file)
+        content = read_document(file)
         try:
-            content = _parsed(data.decode())
             return cls.from_models_info(content) if file.name == MODELS_INFO_FILE else cls.from_dict(content)
-        except ValueError as error:
+        except UserError as error:
             raise UserError(f"{file}: {error}") from error
 
     def write(self, path: str | Path) -> None:
@@ -248,7 +247,7 @@ def _entry(value: object, scheme: Scheme, what: str) -> SymmetryEntry:
     if isinstance(value, str):
         return SymmetryEntry(SymmetryGroup.from_name(value))
     if not isinstance(value, Mapping):
-        raise UserError(f"{value!r} describes no symmetries; write for example {{group: C2, axis: [0, 0, 1]}}")
+        raise UserError(f"{shown(value)} describes no symmetries; write for example {{group: C2, axis: [0, 0, 1]}}")
     if "group" not in value and not value.keys().isdisjoint(_BOP_KEYS):
         return SymmetryEntry(SymmetryGroup.from_bop(value, what))
     _refuse_unknown(value, _GIVEN_KEYS + _DERIVED_KEYS, "it", suggested=_BOP_KEYS)
@@ -277,7 +276,7 @@ def _reference(value: object) -> Matrix | None:
     except (TypeError, ValueError):
         matrix = np.empty(0)
     if matrix.size != 9:
-        raise UserError(f"reference_rotation is {value!r}, not 3 rows of 3 numbers")
+        raise UserError(f"reference_rotation is {shown(value)}, not 3 rows of 3 numbers")
     rows = matrix.reshape(3, 3)
     CanonicalMap(SymmetryGroup.trivial(), reference_rotation=rows)  # refuses what is no rotation
     return tuple(tuple(float(number) for number in row) for row in rows)
@@ -349,32 +348,3 @@ def _check_scheme(scheme: object) -> None:
 def _listed(ids: Iterable[int]) -> str:
     text = ", ".join(map(str, ids))
     return f"objects {text}" if text else "no objects"
-
-
-def _parsed(text: str) -> object:
-    # JSON first: YAML 1.1 reads 1e-06 as a word.
-    with suppress(json.JSONDecodeError):
-        return json.loads(text, object_pairs_hook=_unique)
-    try:
-        return yaml.load(text, Loader=_UniqueKeyLoader)
-    except yaml.YAMLError as error:
-        raise UserError(f"neither JSON nor YAML ({' '.join(str(error).split())})") from error
-
-
-def _unique(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
-    _refuse_repetition([key for key, _ in pairs])
-    return dict(pairs)
-
-
-def _refuse_repetition(keys: list[Any]) -> None:
-    for key in keys:
-        if keys.count(key) > 1:
-            raise UserError(f"{str(key)!r} is listed twice")
-
-
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """YAML that refuses a key given twice, of which plain YAML silently takes the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        _refuse_repetition([key.value for key, _ in node.value])
-        return super().construct_mapping(node, deep)

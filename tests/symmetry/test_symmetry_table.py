@@ -144,7 +144,7 @@ def test_tless_models_info_is_a_table_too(tless_models: Path) -> None:
         ("26: {symmetries_discrete: [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1]]}", "object 26: .*reflection"),
         ("26: {group: C2}\nobject 26: {group: C3}", "object 26 is listed twice"),
         ("26: {group: C2}\n26: {group: C3}", "'26' is listed twice"),
-        ('{"26": {"group": "C2"}, "26": {"group": "C3"}}', "'26' is listed twice"),
+        ('{"26": {"group": "C2"}, "26": {"group": "C3"}}', 'key "26" occurs twice'),
         ("26: {group: C2, group: C3}", "'group' is listed twice"),
         ("26: {}", "no group"),
         ("widget: {group: C2}", "'widget' names no object"),
