@@ -13,7 +13,7 @@ from synthetless.cli.options import Workers
 from synthetless.dataset.card import write_card
 from synthetless.dataset.relabel import adopt, relabel
 from synthetless.symmetry import SymmetryTable
-from synthetless.symmetry.detection import detect_folder, report
+from synthetless.symmetry.detection import detect_folder, parse_tolerances, report
 from synthetless.symmetry.detection.pictures import draw_detected, draw_table
 from synthetless.symmetry.detection.report import describe
 
@@ -65,6 +65,10 @@ def detect_command(
     tolerance_percent: Annotated[
         float, typer.Option(min=0, metavar="PERCENT", help="Largest residual, in % of the diameter.")
     ] = 1.0,
+    tolerance: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ID=VALUE|FILE", help="Of one object: 26=0.5mm or 26=2%; or a table of them. Repeatable."),
+    ] = None,
     scale: Annotated[
         float, typer.Option(min=0, metavar="FACTOR", help="Millimetres per unit of the files; 1000 for metres.")
     ] = 1.0,
@@ -76,7 +80,7 @@ def detect_command(
 
     The report also tells what every other group would leave as residual.
     """
-    detected = detect_folder(models, tolerance_percent, scale, workers)
+    detected = detect_folder(models, tolerance_percent, scale, workers, parse_tolerances(tolerance or ()))
     if out is not None:
         detected.table().write(out)
     if models_out is not None:
