@@ -10,9 +10,8 @@ from typing import Annotated, Literal
 import typer
 
 from synthetless.cli.options import Workers
-from synthetless.dataset.adopt import adopt
 from synthetless.dataset.card import write_card
-from synthetless.dataset.relabel import relabel
+from synthetless.dataset.relabel import adopt, relabel
 from synthetless.symmetry.detection import detect_folder, report
 from synthetless.symmetry.detection.gallery import draw_detected, draw_table
 from synthetless.symmetry.detection.show import describe, read_table

@@ -26,7 +26,7 @@ import psutil
 
 from synthetless.config import Recipe
 from synthetless.dataset.layout import LOGS_FOLDER, ImagePlan
-from synthetless.dataset.store import Dataset, DatasetError, FinishedImage
+from synthetless.dataset.store import DatasetError, DatasetStore, FinishedImage
 from synthetless.errors import UserError
 from synthetless.generation import devices
 from synthetless.generation.devices import CPU, Devices
@@ -317,7 +317,7 @@ def _serve(pipe: Connection, config: WorkerConfig, log: Path) -> None:
     with suppress(EOFError, ConnectionError):
         try:
             worker = DropWorker(config, load_sources(config.recipe), devices.take(config.devices), log)
-            commit = Dataset(config.root, config.recipe).commit
+            commit = DatasetStore(config.root, config.recipe).commit
             pipe.send(None)  # started
             while True:
                 pipe.send(worker.make(pipe.recv(), commit))

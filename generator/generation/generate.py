@@ -15,14 +15,14 @@ from tqdm import tqdm
 from synthetless.config import Recipe
 from synthetless.dataset import records
 from synthetless.dataset.layout import DATASET_FILE, FAILURES_FOLDER, SHEET_FILE, Part, by_drop, plan_image, scene_ids
+from synthetless.dataset.reader import read_recipe
 from synthetless.dataset.sheet import write_contact_sheet
-from synthetless.dataset.store import Dataset
+from synthetless.dataset.store import DatasetStore
 from synthetless.errors import UserError
 from synthetless.generation import executors, ray_executor
 from synthetless.generation.devices import CPU, Devices
 from synthetless.generation.drop import DropRenderer
 from synthetless.generation.executors import DropResult, DropTask, WorkerConfig
-from synthetless.generation.rerender import read_recipe
 from synthetless.generation.sources import Sources, check_photos, load_sources
 from synthetless.io.files import in_turn, locked, write_json
 from synthetless.io.parallel import usable_cores
@@ -95,7 +95,7 @@ def generate(recipe: Recipe, out: Path, execution: Execution) -> Summary:
     sources = load_sources(recipe)
     if not (out / DATASET_FILE).exists():
         check_photos(sources)
-    dataset = Dataset.open(out, recipe, sources.models, sources.scenery_digest)
+    dataset = DatasetStore.open(out, recipe, sources.models, sources.scenery_digest)
     with locked(out, execution.part.name if execution.part else None):
         missing = wanted(dataset, execution.part)
         failures: list[DropResult] = []
@@ -115,7 +115,7 @@ def generate(recipe: Recipe, out: Path, execution: Execution) -> Summary:
     return summary
 
 
-def wanted(dataset: Dataset, part: Part | None) -> list[int]:
+def wanted(dataset: DatasetStore, part: Part | None) -> list[int]:
     """Numbers of the images that do not exist yet and are this run's to make."""
     views = dataset.recipe.camera.views_per_drop
     return [number for number in dataset.missing() if part is None or part.takes(plan_image(number, views).drop)]
@@ -140,7 +140,7 @@ def retry(out: Path, drop: int, textures: str | None = None) -> int:
     if textures is not None:
         recipe = recipe.model_copy(update={"source": recipe.source.model_copy(update={"textures": textures})})
     sources = load_sources(recipe)
-    dataset = Dataset.open(out, recipe, sources.models, sources.scenery_digest)
+    dataset = DatasetStore.open(out, recipe, sources.models, sources.scenery_digest)
     views = recipe.camera.views_per_drop
     plans = [plan_image(number, views) for number in range(drop * views, min((drop + 1) * views, recipe.images))]
     if not plans:
@@ -153,7 +153,7 @@ def retry(out: Path, drop: int, textures: str | None = None) -> int:
     return len(plans)
 
 
-def _make(dataset: Dataset, sources: Sources, missing: list[int], execution: Execution) -> list[DropResult]:
+def _make(dataset: DatasetStore, sources: Sources, missing: list[int], execution: Execution) -> list[DropResult]:
     """Make the missing images; return the drops that failed, in their order."""
     failures: list[DropResult] = []
     views = dataset.recipe.camera.views_per_drop
@@ -178,20 +178,22 @@ def _make(dataset: Dataset, sources: Sources, missing: list[int], execution: Exe
     return sorted(failures, key=lambda result: result.task.drop)
 
 
-def _results(dataset: Dataset, tasks: Iterable[DropTask], execution: Execution) -> Generator[DropResult, None, None]:
+def _results(
+    dataset: DatasetStore, tasks: Iterable[DropTask], execution: Execution
+) -> Generator[DropResult, None, None]:
     config = WorkerConfig(dataset.recipe, dataset.root, execution.threads, execution.drop_limit_s, execution.devices)
     if execution.cluster is not None:
         return ray_executor.run(tasks, config, execution.cluster, execution.workers)
     return executors.run(tasks, config, execution.processes)
 
 
-def _draw_sheet(dataset: Dataset) -> None:
+def _draw_sheet(dataset: DatasetStore) -> None:
     if "rgb" in dataset.recipe.outputs:
         with in_turn(dataset.root):  # or the sheet of another part, drawn of fewer images, might come last
             write_contact_sheet(dataset.root, dataset.root / SHEET_FILE, dataset.recipe.split)
 
 
-def _note_failure(dataset: Dataset, sources: Sources, result: DropResult) -> None:
+def _note_failure(dataset: DatasetStore, sources: Sources, result: DropResult) -> None:
     """Leave a note of a failed drop with the scene that it began with; take away that of one that went well."""
     drop, recipe = result.task.drop, dataset.recipe
     path = dataset.root / FAILURES_FOLDER / f"{drop:08d}.json"
@@ -202,7 +204,7 @@ def _note_failure(dataset: Dataset, sources: Sources, result: DropResult) -> Non
         path.unlink(missing_ok=True)
 
 
-def _summarise(dataset: Dataset, made: int, failures: list[DropResult]) -> Summary:
+def _summarise(dataset: DatasetStore, made: int, failures: list[DropResult]) -> Summary:
     images, fractions = 0, []
     made_any = (dataset.root / dataset.recipe.split).is_dir()
     for scene_id in scene_ids(dataset.root, dataset.recipe.split) if made_any else []:

@@ -22,7 +22,7 @@ from typing import Any
 from uuid import uuid4
 
 from synthetless.dataset.layout import LOGS_FOLDER
-from synthetless.dataset.store import Dataset, FinishedImage, versions
+from synthetless.dataset.store import DatasetStore, FinishedImage, versions
 from synthetless.errors import UserError
 from synthetless.generation.devices import CPU, ask, take_assigned
 from synthetless.generation.executors import FAULT_VARIABLE, DropResult, DropTask, DropWorker, WorkerConfig
@@ -137,7 +137,7 @@ class RayWorker:
         os.environ.update(environment)
         self._config = config
         shares_folder = os.access(token, os.W_OK)
-        self._dataset = Dataset(config.root, config.recipe) if shares_folder else None
+        self._dataset = DatasetStore(config.root, config.recipe) if shares_folder else None
         name = f"worker-{platform.node()}-{os.getpid()}.log"
         # Ray keeps what its workers print, in a file for each of them.
         self._log = config.root / LOGS_FOLDER / name if shares_folder else Path("/dev/stdout")
@@ -224,7 +224,7 @@ class _RayPool:
     def __init__(self, ray: Any, config: WorkerConfig, sources: Sources, token: Path, workers: int | None) -> None:
         self._ray = ray
         self._sources = sources
-        self._dataset = Dataset(config.root, config.recipe)
+        self._dataset = DatasetStore(config.root, config.recipe)
         self._wanted = workers
         self._nodes, self._nodes_read = living_nodes(ray), time.monotonic()
         self._needs = needs_of(config, self._nodes)

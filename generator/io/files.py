@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -49,6 +50,21 @@ def atomic_write(path: Path, data: bytes, durable: bool = False) -> None:
     """Write a whole file at once; arguments and errors as in ``atomic_file``."""
     with atomic_file(path, durable) as file:
         file.write(data)
+
+
+def replace_file(source: Path, target: Path) -> None:
+    """Move a whole file to where another one may be, on another disk, too; at every moment one of them is there.
+
+    Raises:
+        UserError: it cannot be written there.
+    """
+    try:
+        source.replace(target)
+    except OSError as error:
+        if error.errno != errno.EXDEV:
+            raise UserError(f"{target}: cannot be written ({error.strerror})") from error
+        atomic_write(target, read_bytes(source), durable=True)
+        source.unlink()
 
 
 @contextmanager

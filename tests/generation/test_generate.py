@@ -16,13 +16,13 @@ import pytest
 from trees import SHARED_LOCK, data_files
 
 from synthetless.annotation.instances import PosedModel
-from synthetless.annotation.raycast import RayCaster
+from synthetless.annotation.scene import scene_caster
 from synthetless.config import load_recipe
 from synthetless.dataset import records
 from synthetless.dataset.layout import ScenePaths
+from synthetless.dataset.reader import read_recipe, read_specs
 from synthetless.generation.executors import FAULT_VARIABLE
 from synthetless.generation.generate import Execution, generate
-from synthetless.generation.rerender import read_recipe, read_recorded
 from synthetless.io.cache import CACHE_VARIABLE
 from synthetless.io.files import read_json
 from synthetless.io.models import load_models
@@ -221,7 +221,7 @@ def test_images_are_neither_black_nor_blown_out_nor_empty(dataset: Path) -> None
 
 
 def test_most_of_what_is_dropped_is_in_the_frame(dataset: Path) -> None:
-    recorded = read_recorded(ScenePaths.of(dataset, 1))
+    recorded = read_specs(ScenePaths.of(dataset, 1))
     placed = sum(len(image.scene.objects) for image in recorded.values())
     shown = sum(len(image.instances) for image in recorded.values())
     assert shown / placed > 0.7
@@ -241,7 +241,7 @@ def test_the_canonical_pose_has_the_silhouette_of_the_true_pose(dataset: Path) -
         (small.cy + 0.5) * scale - 0.5,
     )
     models = load_models(dataset / "models")
-    caster = RayCaster({key: (model.vertices_mm, model.faces) for key, model in models.items()})
+    caster = scene_caster({"model": models})
     scene = ScenePaths.of(dataset, 1)
     labels = records.read_scene_json(scene.scene_gt_canonical)
     for im_id, entries in records.read_scene_json(scene.scene_gt).items():

@@ -26,7 +26,7 @@ from trees import data_files
 
 from synthetless.config import Recipe, load_recipe
 from synthetless.dataset.layout import LOGS_FOLDER, by_drop
-from synthetless.dataset.store import Dataset, versions
+from synthetless.dataset.store import DatasetStore, versions
 from synthetless.generation import executors, ray_executor
 from synthetless.generation.devices import Devices
 from synthetless.generation.executors import FAULT_VARIABLE, DropResult, DropTask, WorkerConfig
@@ -83,7 +83,7 @@ def two_nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 def _make(root: Path, recipe: Recipe, execute: Execute, drop_limit_s: float = 300.0) -> list[DropResult]:
     """What generate does, with this executor."""
     sources = load_sources(recipe)
-    dataset = Dataset.open(root, recipe, sources.models, sources.scenery_digest)
+    dataset = DatasetStore.open(root, recipe, sources.models, sources.scenery_digest)
     tasks = [DropTask(drop, tuple(images)) for drop, images in by_drop(dataset.missing(), recipe.camera.views_per_drop)]
     results = list(execute(tasks, WorkerConfig(recipe, root, threads=1, drop_limit_s=drop_limit_s)))
     dataset.finish()
