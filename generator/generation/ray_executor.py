@@ -11,7 +11,6 @@ import os
 import platform
 import re
 import sys
-import tempfile
 import time
 from collections import Counter, deque
 from collections.abc import Generator, Iterable, Iterator, Mapping
@@ -28,7 +27,7 @@ from synthetless.generation.devices import CPU, ask, take_assigned
 from synthetless.generation.executors import FAULT_VARIABLE, DropResult, DropTask, DropWorker, WorkerConfig
 from synthetless.generation.sources import Sources, load_sources
 from synthetless.io.cache import CACHE_VARIABLE
-from synthetless.io.files import atomic_write
+from synthetless.io.files import atomic_write, user_folder
 from synthetless.scenes.blender import BlenderError
 
 Node = Mapping[str, Any]
@@ -200,7 +199,7 @@ def _with_photos(inputs: SharedInputs, photos: Mapping[str, bytes] | None) -> So
     if photos is None:
         return None
     # One for all workers of the node; it is named by its content, so that it may stay.
-    folder = Path(tempfile.gettempdir()) / f"synthetless-{os.getuid()}-{inputs.digest[:16]}"
+    folder = user_folder() / f"photos-{inputs.digest[:16]}"
     for name, content in photos.items():
         if not (folder / name).exists():
             atomic_write(folder / name, content)
