@@ -16,6 +16,7 @@ from collections import Counter, deque
 from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -36,6 +37,8 @@ Node = Mapping[str, Any]
 _TICK_S = 1.0
 _NODES_EVERY_S = 5.0
 """How often the list of nodes is read: those that join get workers, too."""
+_AHEAD = 10_000
+"""So many tasks are planned ahead, more than any cluster has workers, but not a million."""
 _PATIENCE_S = 60.0
 """After so long without any worker the user is told what is waited for."""
 _DEATHS = 2
@@ -244,8 +247,11 @@ class _RayPool:
 
     def work(self, tasks: Iterable[DropTask]) -> Iterator[DropResult]:
         """Do all the tasks; errors as in ``run``."""
-        self._waiting.extend(tasks)
-        while self._waiting or any(call.task for call in self._calls.values()):
+        source = iter(tasks)
+        while True:
+            self._waiting.extend(islice(source, max(0, _AHEAD - len(self._waiting))))
+            if not self._waiting and not any(call.task for call in self._calls.values()):
+                return
             self._start_workers()
             for ref in self._ray.wait(list(self._calls), timeout=_TICK_S)[0]:
                 result = self._receive(ref, self._calls.pop(ref))
