@@ -42,7 +42,9 @@ _AHEAD = 10_000
 _PATIENCE_S = 60.0
 """After so long without any worker the user is told what is waited for."""
 _DEATHS = 2
-"""A drop over which so many workers died is given up; so is a cluster where so many die while they start."""
+"""A drop over which so many workers died is given up."""
+_DEATHS_AT_START = 5
+"""The run ends when so many workers have died while starting, one after the other, and none got through."""
 _LOST_NODES = 4
 """A node is lost through no fault of its drops; so many, one after the other, with the same drop are no accident."""
 _CONNECT_LIMIT_S = 30.0
@@ -339,8 +341,10 @@ class _RayPool:
         task, info = call.task, call.info
         if task is None or info is None:
             self._deaths_at_start += living >= call.nodes
-            if self._deaths_at_start >= _DEATHS:
-                raise BlenderError(f"workers of the Ray cluster die while they start ({_exit_of(death)})")
+            if self._deaths_at_start >= _DEATHS_AT_START:
+                raise BlenderError(
+                    f"{self._deaths_at_start} workers of the Ray cluster died while starting ({_exit_of(death)})"
+                )
             return None
         node_lost = info.node_id not in living
         self._deaths[task.drop, node_lost] += 1
