@@ -52,7 +52,7 @@ def settings_help() -> str:
 
 def generate_command(
     recipe: Annotated[Path, typer.Argument(help="The recipe, a YAML file.")],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the dataset. Run again to go on with it.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the dataset. Run again to continue it.")],
     images: Annotated[
         int | None, typer.Option(metavar="N", help="How many images; more than before extends the dataset.")
     ] = None,
@@ -120,7 +120,7 @@ def generate_command(
     try:
         summary = generate(resolved, out, execution)
     except KeyboardInterrupt:  # here, since typer would end without a word
-        leave("interrupted; run the same command again to go on", EXIT_INTERRUPTED)
+        leave("interrupted; run the same command again to continue", EXIT_INTERRUPTED)
     _report(summary, out, as_json)
     if summary.failures:
         raise typer.Exit(EXIT_FAILED)

@@ -90,6 +90,18 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(draft, ignore_errors=True)
 
 
+def remove_file(path: Path) -> None:
+    """Remove a file, if it is there.
+
+    Raises:
+        UserError: it cannot be removed.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be removed ({error.strerror})") from None
+
+
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write a JSON object with one entry per line, in the mapping's order, keys inside the entries sorted.
 
