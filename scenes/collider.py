@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from synthetless.errors import UserError
 from synthetless.scenes.contact import Surface
-from synthetless.scenes.mesh import Mesh
+from synthetless.scenes.spec import Mesh
 
 Array = NDArray[np.float64]
 

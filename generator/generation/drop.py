@@ -1,6 +1,6 @@
 """Makes the images of a drop: draw it, let it fall, render it, measure it, encode it.
 
-One studio per process: it holds the Blender session, the meshes and their ray-casting trees, all loaded once.
+One DropRenderer per process: it holds the Blender session, the meshes and their ray-casting trees, all loaded once.
 """
 
 from __future__ import annotations
@@ -26,12 +26,11 @@ from synthetless.io.color import develop, exposure_gain
 from synthetless.io.images import encode_exr
 from synthetless.io.models import ObjectModel
 from synthetless.scenes.blender import CPU, RenderDevice
-from synthetless.scenes.mesh import Mesh
 from synthetless.scenes.physics import Collider, NotSettled, PhysicsSettings, collider, settle
-from synthetless.scenes.render import BuiltScene, Stage
+from synthetless.scenes.render import BlenderScene, BlenderSession
 from synthetless.scenes.rotations import matrix
 from synthetless.scenes.sampling import sample_scene
-from synthetless.scenes.spec import Pose, Role, SceneSpec
+from synthetless.scenes.spec import Mesh, Pose, Role, SceneSpec
 
 _MM = 1000.0
 ModelKey = tuple[Role, int]
@@ -41,11 +40,11 @@ class DropFailed(Exception):
     """A drop did not come to rest however often it was thrown; the message says why the last throw did not."""
 
 
-class Studio:
+class DropRenderer:
     """Turns drops into images.
 
     Attributes:
-        stage: the Blender session.
+        session: the Blender session.
     """
 
     def __init__(
@@ -73,7 +72,7 @@ class Studio:
         self._meshes = {key: Mesh(model.vertices_mm / _MM, model.faces) for key, model in models.items()}
         self._colliders: dict[ModelKey, Collider] = {}
         self._caster = RayCaster({_caster_key(*key): (model.vertices_mm, model.faces) for key, model in models.items()})
-        self.stage = Stage(
+        self.session = BlenderSession(
             self._meshes,
             self._intrinsics,
             recipe.render,
@@ -96,7 +95,7 @@ class Studio:
             UserError: an input file became unreadable.
         """
         spec, settled = self.drop(drop)
-        with self.stage.scene(spec, settled) as scene:
+        with self.session.scene(spec, settled) as scene:
             for plan in plans:
                 yield self._image(plan, scene, settled)
 
@@ -125,7 +124,7 @@ class Studio:
             self._colliders[key] = collider(self._meshes[key])
         return self._colliders[key]
 
-    def _image(self, plan: ImagePlan, scene: BuiltScene, settled: Sequence[Pose]) -> FinishedImage:
+    def _image(self, plan: ImagePlan, scene: BlenderScene, settled: Sequence[Pose]) -> FinishedImage:
         recipe = self._recipe
         R_w2c, t_w2c_m = scene.extrinsics(plan.view)
         t_w2c = t_w2c_m * _MM

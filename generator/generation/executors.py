@@ -21,7 +21,7 @@ from synthetless.dataset.layout import LOGS_FOLDER, ImagePlan
 from synthetless.dataset.store import Dataset, DatasetError
 from synthetless.generation import devices
 from synthetless.generation.devices import CPU, Devices
-from synthetless.generation.drop import DropFailed, Studio
+from synthetless.generation.drop import DropFailed, DropRenderer
 from synthetless.generation.sources import load_sources
 from synthetless.scenes.blender import BlenderError
 
@@ -133,12 +133,12 @@ def _outcome(future: Future[Outcome], job: Job, place: Workplace) -> Outcome | N
 def _make(place: Workplace, job: Job) -> Outcome:
     """In the worker: make and commit the images of one drop."""
     inject_fault(job.drop)
-    dataset, studio = Dataset(place.root, place.recipe), _studio(place)
+    dataset, renderer = Dataset(place.root, place.recipe), _studio(place)
     if psutil.Process().memory_info().rss > _memory_at_start(place) + GROWTH_LIMIT_BYTES:
         os._exit(_RENEW)
     made = 0
     try:
-        for image in studio.make(job.drop, job.images):
+        for image in renderer.make(job.drop, job.images):
             dataset.commit(image)
             made += 1
     except DropFailed as failure:
@@ -147,13 +147,13 @@ def _make(place: Workplace, job: Job) -> Outcome:
 
 
 @lru_cache(maxsize=1)
-def _studio(place: Workplace) -> Studio:
-    """The studio of this worker, set up at its first drop: from there on Blender talks to the worker's log."""
+def _studio(place: Workplace) -> DropRenderer:
+    """The renderer of this worker, set up at its first drop: from there on Blender talks to the worker's log."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's to answer
     logs = place.root / LOGS_FOLDER
     logs.mkdir(exist_ok=True)
     log = logs / f"worker-{os.getpid()}.log"
-    return Studio(place.recipe, load_sources(place.recipe), place.threads, devices.take(place.devices), log)
+    return DropRenderer(place.recipe, load_sources(place.recipe), place.threads, devices.take(place.devices), log)
 
 
 @lru_cache(maxsize=1)

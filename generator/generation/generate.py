@@ -19,7 +19,7 @@ from synthetless.dataset.store import Dataset
 from synthetless.errors import UserError
 from synthetless.generation import cluster, executors
 from synthetless.generation.devices import CPU, Devices
-from synthetless.generation.drop import Studio
+from synthetless.generation.drop import DropRenderer
 from synthetless.generation.executors import Job, Outcome, Workplace
 from synthetless.generation.rerender import read_recipe
 from synthetless.generation.sources import Sources, check_photos, load_sources
@@ -142,7 +142,7 @@ def redo(out: Path, drop: int, textures: str | None = None) -> int:
     if not plans:
         raise UserError(f"{out}: has no drop {drop}; its {recipe.images} images show the drops from 0 on")
     with locked(out):
-        for image in Studio(recipe, sources).make(drop, plans):
+        for image in DropRenderer(recipe, sources).make(drop, plans):
             dataset.commit(image)
         (out / FAILURES_FOLDER / f"{drop:08d}.json").unlink(missing_ok=True)
         dataset.finish()

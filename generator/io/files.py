@@ -158,6 +158,12 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return content
 
 
+def nearest_existing(folder: Path) -> Path:
+    """The folder itself, or the innermost of its parents that exists."""
+    absolute = folder.absolute()
+    return next(place for place in (absolute, *absolute.parents) if place.is_dir())
+
+
 class LockedError(UserError):
     """Another process is at work in the folder; the message is one line."""
 

@@ -16,10 +16,9 @@ import pytest
 import trimesh
 
 from synthetless.scenes.contact import Posed, Surface, measure
-from synthetless.scenes.mesh import Mesh
 from synthetless.scenes.physics import Collider, NotSettled, PhysicsSettings, Settled, collider, settle
 from synthetless.scenes.rotations import matrix, random_rotation
-from synthetless.scenes.spec import Pose
+from synthetless.scenes.spec import Mesh, Pose
 
 bpy = pytest.importorskip("bpy", exc_type=ImportError)
 pytestmark = pytest.mark.blender

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from typing import Any
 
 from synthetless.errors import UserError
+from synthetless.generation.devices import ask
 from synthetless.generation.executors import Workplace
-from synthetless.generation.machine import ask
 
 Node = Mapping[str, Any]
 """A node as Ray describes it: NodeID, Alive, Resources, ..."""

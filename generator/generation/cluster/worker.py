@@ -1,4 +1,4 @@
-"""A worker of the cluster: an actor with a studio of its own, somewhere on a node."""
+"""A worker of the cluster: an actor with a renderer of its own, somewhere on a node."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from synthetless.dataset.layout import LOGS_FOLDER
 from synthetless.dataset.store import Dataset, DatasetError, FinishedImage, versions
 from synthetless.errors import UserError
 from synthetless.generation.devices import take_assigned
-from synthetless.generation.drop import DropFailed, Studio
+from synthetless.generation.drop import DropFailed, DropRenderer
 from synthetless.generation.executors import FAULT_VARIABLE, GROWTH_LIMIT_BYTES, Job, Workplace, inject_fault, stumbled
 from synthetless.generation.sources import Sources
 from synthetless.io.files import atomic_write
@@ -97,7 +97,7 @@ class Worker:
         self._log = place.root / LOGS_FOLDER / name if shares_folder else Path("/dev/stdout")
 
     def move_in(self, supplies: Supplies, photos: Mapping[str, bytes] | None) -> Desk:
-        """Set up the studio.
+        """Set up the renderer.
 
         Args:
             supplies: what it is made from.
@@ -116,7 +116,7 @@ class Worker:
             if sources is None:
                 return replace(desk, lacks_photos=True)
             device = take_assigned(self._place.devices)
-            self._studio = Studio(self._place.recipe, sources, self._place.threads, device, self._log)
+            self._studio = DropRenderer(self._place.recipe, sources, self._place.threads, device, self._log)
         except BlenderError as error:
             raise BlenderError(f"node {desk.node}: {error}") from None
         except ValueError as error:
