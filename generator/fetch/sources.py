@@ -8,13 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
-from scipy.spatial.distance import pdist
-
 from synthetless.errors import UserError
 from synthetless.fetch.archive import Limits
+from synthetless.io.meshes import diameter
 from synthetless.io.models import load_models
 
 TLESS_DIAMETERS_MM = (
@@ -71,18 +67,12 @@ def check_tless(folder: Path) -> None:
         raise UserError(f"holds {len(models)} models with ids {min(models)} to {max(models)}; T-LESS has 1 to 30")
     for obj_id, expected_mm in enumerate(TLESS_DIAMETERS_MM, start=1):
         model = models[obj_id]
-        measured_mm = diameter_mm(model.vertices_mm)
+        measured_mm = diameter(model.vertices_mm)
         for what, value_mm in ("the mesh", measured_mm), ("models_info.json", model.diameter_mm):
             if abs(value_mm - expected_mm) > DIAMETER_TOLERANCE_MM:
                 raise UserError(
                     f"object {obj_id}: diameter {value_mm:.3f} mm by {what}; {expected_mm:.3f} mm is that of T-LESS"
                 )
-
-
-def diameter_mm(vertices_mm: NDArray[np.float64]) -> float:
-    """Largest distance between two of the (V, 3) vertices, millimetres; it is one between corners of their hull."""
-    hull = vertices_mm[ConvexHull(vertices_mm).vertices]
-    return float(pdist(hull).max())
 
 
 def check_dtd(folder: Path) -> None:

@@ -10,24 +10,24 @@ import pytest
 from detect_shapes import box, prism
 from numpy.typing import NDArray
 
+from synthetless.io.meshes import TriangleMesh
 from synthetless.symmetry import SymmetryGroup, SymmetryTable
 from synthetless.symmetry.detection.detect import measure
 from synthetless.symmetry.detection.gallery import draw_table
-from synthetless.symmetry.detection.meshes import Mesh
 from synthetless.symmetry.detection.pictures import picture
 from synthetless.symmetry.table import SymmetryEntry
 
 VIEWS_PX, HEAD_PX = 1200, 34
 
 
-def drawn(mesh: Mesh, *groups: SymmetryGroup) -> NDArray[np.uint8]:
+def drawn(mesh: TriangleMesh, *groups: SymmetryGroup) -> NDArray[np.uint8]:
     findings = [measure(mesh.vertices_mm, mesh.faces, mesh.diameter_mm, group) for group in groups]
     return picture("object 1", mesh, findings, 0.01 * mesh.diameter_mm)
 
 
-def mesh_of(x: float, y: float, z: float) -> Mesh:
+def mesh_of(x: float, y: float, z: float) -> TriangleMesh:
     part = box(x, y, z)
-    return Mesh(np.asarray(part.vertices), np.asarray(part.faces), float(np.linalg.norm(part.extents)))
+    return TriangleMesh(np.asarray(part.vertices), np.asarray(part.faces), is_verbatim=False)
 
 
 def saturation(image: NDArray[np.uint8]) -> NDArray[np.int_]:

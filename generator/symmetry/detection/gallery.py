@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from synthetless.errors import UserError
+from synthetless.io.meshes import read_mesh
+from synthetless.io.models import find_meshes
 from synthetless.io.parallel import each
 from synthetless.symmetry.detection.detect import Finding, measure
 from synthetless.symmetry.detection.folder import DetectedFolder
-from synthetless.symmetry.detection.meshes import find_meshes, read_mesh
 from synthetless.symmetry.detection.pictures import picture, write_picture
 from synthetless.symmetry.groups import SymmetryGroup
 from synthetless.symmetry.table import SymmetryTable

@@ -16,10 +16,10 @@ from synthetless.annotation.instances import PosedModel
 from synthetless.annotation.raycast import RayCaster
 from synthetless.io.files import atomic_write
 from synthetless.io.images import encode_png
+from synthetless.io.meshes import TriangleMesh
 from synthetless.scenes.spec import Intrinsics
 from synthetless.symmetry.detection.detect import Finding
 from synthetless.symmetry.detection.distance import PIECE, Surface
-from synthetless.symmetry.detection.meshes import Mesh
 from synthetless.symmetry.detection.orbits import moved, spread_elements
 from synthetless.symmetry.detection.report import group_cells
 from synthetless.symmetry.groups import SymmetryGroup
@@ -40,7 +40,7 @@ _MAIN_AXIS = (210, 20, 20)
 _DASHES = 120
 
 
-def picture(title: str, mesh: Mesh, findings: Sequence[Finding], tolerance_mm: float) -> Image:
+def picture(title: str, mesh: TriangleMesh, findings: Sequence[Finding], tolerance_mm: float) -> Image:
     """One row of views per finding: (H, W, 3) RGB.
 
     The colour of a surface point is its largest deviation over (at most 16, evenly chosen) elements of the group; a
@@ -86,7 +86,7 @@ class _Axis(NamedTuple):
 
 
 class _Views:
-    def __init__(self, mesh: Mesh) -> None:
+    def __init__(self, mesh: TriangleMesh) -> None:
         low, high = mesh.vertices_mm.min(axis=0), mesh.vertices_mm.max(axis=0)
         self._center, self._diameter = (low + high) / 2, mesh.diameter_mm
         self._cameras = [_camera(mesh, -normalise(d), self._center) for d in _DIRECTIONS]
@@ -155,7 +155,7 @@ class _Views:
             _line(image, pixels[first], pixels[last], axis.pen)
 
 
-def _camera(mesh: Mesh, forward: Floats, center: Floats) -> _Camera:
+def _camera(mesh: TriangleMesh, forward: Floats, center: Floats) -> _Camera:
     """A camera that looks along `forward`, z up, and sees the whole part in the middle of the tile."""
     right = normalise(np.cross(forward, [0.0, 0.0, 1.0]))
     R = np.stack([right, np.cross(forward, right), forward])

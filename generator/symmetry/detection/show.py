@@ -10,8 +10,8 @@ import numpy as np
 
 from synthetless.errors import UserError
 from synthetless.io.files import read_json
+from synthetless.io.models import INFO_FILE
 from synthetless.symmetry.atlas import SCHEMES, Scheme, smallest_margin_deg
-from synthetless.symmetry.detection.folder import INFO_FILE
 from synthetless.symmetry.detection.report import WIDTH, aligned, axis_text, group_cells
 from synthetless.symmetry.groups import SymmetryGroup
 from synthetless.symmetry.point_groups import parse_name
