@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from fetch_server import Handler, running
 
 from synthetless.cli.app import main
 from synthetless.cli.terminal import printable
+from synthetless.doctor import Check
 from synthetless.errors import UserError
 from synthetless.scenes.blender import BlenderError
 
@@ -136,18 +138,42 @@ def test_what_steers_a_terminal_is_escaped(text: str, shown: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["\x1b[31mred", "a\x07\x7fb", os.fsdecode(b"\xff\xfe"), "\u202eabc"])
-def test_foreign_names_are_printed_escaped(name: str, tmp_path: Path) -> None:
+def test_foreign_names_are_printed_escaped(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     """In an error, and in a report on stdout."""
     folder = tmp_path / name
-    for make in (False, True):
-        if make:
-            folder.mkdir()
-            (folder / "symmetries.json").write_text(json.dumps({"objects": {}}))
-        done = subprocess.run(
-            [sys.executable, "-m", "synthetless", "validate", os.fsencode(folder)], capture_output=True, check=False
-        )
-        printed = (done.stdout + done.stderr).decode()
-        assert done.returncode in {1, 2}
+    monkeypatch.setattr("synthetless.doctor.examine", lambda out: [Check("disk", "fail", str(out), f"leave {out}")])
+    for command, code in ((["validate", str(folder)], 2), (["doctor", "--out", str(folder)], 1)):
+        monkeypatch.setattr(sys, "argv", ["synthetless", *command])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        printed = "".join(capfd.readouterr())
+        assert stop.value.code == code
         assert printable(name) in printed
         assert all(c.isprintable() or c == "\n" for c in printed)
-        assert "Traceback" not in printed
+
+
+def test_the_words_of_a_server_are_printed_escaped(tmp_path: Path) -> None:
+    """In a warning, since the server may recover, and in the error that ends the command."""
+
+    def evil(status: int) -> Callable[[Handler], None]:
+        def reply(handler: Handler) -> None:
+            handler.send_response(status, "no \x1b[2J\x1b]0;title\x07 way")
+            handler.end_headers()
+
+        return reply
+
+    with running() as server:
+        server.script = [evil(503), evil(403)]
+        done = subprocess.run(
+            [sys.executable, "-m", "synthetless", "fetch", "dtd", "--to", "out", "--from", server.url],
+            env={**os.environ, "no_proxy": "127.0.0.1"},
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 2
+    assert [line.count(r"no \x1b[2J\x1b]0;title\x07 way") for line in done.stderr.splitlines()] == [1, 1]
+    assert "\x1b" not in done.stderr
