@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks import default_models, keep
 from synthetless.annotation.instances import PosedModel
 from synthetless.annotation.raycast import Plane, RayCaster
+from synthetless.annotation.scene import scene_caster
 from synthetless.io.models import ObjectModel, load_models
 from synthetless.scenes.camera import extrinsics
 from synthetless.scenes.spec import Intrinsics, View
@@ -40,7 +41,7 @@ def main() -> None:
     parser.add_argument("models", type=Path, nargs="?", default=default_models(), help="a BOP models folder")
     models = load_models(parser.parse_args().models)
 
-    caster = RayCaster({obj_id: (model.vertices_mm, model.faces) for obj_id, model in models.items()})
+    caster = scene_caster({"model": models})
     build_ms = _time_building(caster, models)
     scenes = [_random_scene(np.random.default_rng(seed), list(models)) for seed in range(N_SCENES)]
     seconds = [[[_time(caster, scene, case) for scene in scenes] for case in CASES.values()] for _ in range(N_ROUNDS)]

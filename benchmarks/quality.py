@@ -21,7 +21,7 @@ from benchmarks import RESULTS, keep, parser, tless_recipe
 from synthetless.config import Recipe
 from synthetless.generation.drop import DropRenderer
 from synthetless.generation.sources import load_sources
-from synthetless.io.color import develop, exposure_gain
+from synthetless.io.color import exposure_gain, tonemap
 from synthetless.io.images import decode_rgb, encode_jpeg, encode_png
 from synthetless.scenes.render import BlenderSession
 from synthetless.scenes.settings import RenderSettings
@@ -59,8 +59,8 @@ def main() -> None:
                 linear = scene.render(0)
                 spent = time.process_time() - began
                 gain = exposure_gain(linear, recipe.render.exposure)
-                content = encode(develop(linear, gain))
-                pair = decode_rgb(content), develop(reference, gain)
+                content = encode(tonemap(linear, gain))
+                pair = decode_rgb(content), tonemap(reference, gain)
                 rows[name].append((psnr(*pair), ssim(*pair), spent, len(content) / 1000))
                 print(drop, name, *(f"{value:.3f}" for value in rows[name][-1]), flush=True)
     columns = ("psnr_db", "ssim", "cpu_s", "kilobytes")

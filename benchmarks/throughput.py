@@ -17,7 +17,7 @@ from pathlib import Path
 from benchmarks import keep, parser, tless_recipe
 from synthetless.config import Recipe
 from synthetless.dataset.layout import plan_image
-from synthetless.dataset.store import Dataset
+from synthetless.dataset.store import DatasetStore
 from synthetless.generation import devices
 from synthetless.generation.drop import DropRenderer
 from synthetless.generation.sources import load_sources
@@ -27,11 +27,11 @@ PHASES = {
     "physics": [("physics.py", "settle"), ("drop.py", "_collider")],
     "build": [("render.py", "scene")],
     "annotate": [("raycast.py", "annotate")],
-    "develop": [("develop.py", "exposure_gain"), ("develop.py", "develop")],
-    "encode": [("drop.py", "encode")],
-    "commit": [("dataset.py", "commit")],
+    "develop": [("color.py", "exposure_gain"), ("color.py", "tonemap")],
+    "encode": [("store.py", "_encode")],
+    "commit": [("store.py", "commit")],
 }
-"""Functions whose time, with all that they call, makes up a session."""
+"""Functions whose time, with all that they call, makes up a phase."""
 
 _LINE = re.compile(r"^Fra.*Time:(\d+):(\d+\.\d+) .*(Sample 0/|Finished)", re.MULTILINE)
 
@@ -63,7 +63,7 @@ def measure(recipe: Recipe, images: int, wanted: str) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "blender.log"
         sources = load_sources(recipe)
-        dataset = Dataset.open(Path(folder) / "dataset", recipe, sources.models, sources.scenery_digest)
+        dataset = DatasetStore.open(Path(folder) / "dataset", recipe, sources.models, sources.scenery_digest)
         began = time.perf_counter()
         renderer = DropRenderer(recipe, sources, 1, devices.take(devices.choose(wanted)), log)
         stages = {"start": time.perf_counter() - began}

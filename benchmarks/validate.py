@@ -9,7 +9,6 @@ than the cores, reading sets the pace.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import resource
 import tempfile
 import time
@@ -20,9 +19,10 @@ from benchmarks import ROOT, keep
 from synthetless.config import Recipe, load_recipe
 from synthetless.dataset import records
 from synthetless.dataset.layout import MODELS_FOLDER, ImagePlan, ScenePaths, plan_image
-from synthetless.dataset.store import Dataset, FinishedImage
+from synthetless.dataset.reader import read_recipe
+from synthetless.dataset.records import ImageRecord
+from synthetless.dataset.store import DatasetStore, FinishedImage
 from synthetless.generation.generate import Execution, generate
-from synthetless.generation.rerender import read_recipe
 from synthetless.io.files import read_json, read_json_lines
 from synthetless.io.models import load_models
 from synthetless.io.parallel import usable_cores
@@ -74,7 +74,7 @@ def _repeat(source: Path, root: Path, n_images: int) -> None:
     recipe = read_recipe(source)
     originals = _images(source, recipe)
     recipe = recipe.model_copy(update={"images": n_images})
-    dataset = Dataset.open(root, recipe, load_models(source / MODELS_FOLDER), "")
+    dataset = DatasetStore.open(root, recipe, load_models(source / MODELS_FOLDER), "")
     for number in range(n_images):
         plan = plan_image(number, recipe.camera.views_per_drop)
         dataset.commit(_renumbered(originals[number % len(originals)], plan))
@@ -90,11 +90,13 @@ def _images(dataset: Path, recipe: Recipe) -> list[FinishedImage]:
         FinishedImage(
             plan_image(im_id, recipe.camera.views_per_drop),
             _files(scene, im_id),
-            cameras[im_id],
-            gts[im_id],
-            infos[im_id],
-            [annotation for annotation in annotations if annotation["image_id"] == im_id],
-            next(spec for spec in specs if spec["image_id"] == im_id),
+            {
+                "camera": cameras[im_id],
+                "gt": gts[im_id],
+                "gt_info": infos[im_id],
+                "coco": [annotation for annotation in annotations if annotation["image_id"] == im_id],
+                "spec": next(spec for spec in specs if spec["image_id"] == im_id),
+            },
         )
         for im_id in gts
     ]
@@ -107,13 +109,14 @@ def _files(scene: ScenePaths, im_id: int) -> Mapping[str, bytes]:
 def _renumbered(image: FinishedImage, plan: ImagePlan) -> FinishedImage:
     """The same image in another place of the dataset, as if another drop had come to rest the same way."""
     old, new = f"{image.plan.im_id:06d}", f"{plan.im_id:06d}"
-    return dataclasses.replace(
-        image,
-        plan=plan,
-        files={name.replace(f"/{old}", f"/{new}"): content for name, content in image.files.items()},
-        coco=[{**annotation, "image_id": plan.im_id} for annotation in image.coco],
-        spec={**image.spec, "image_id": plan.im_id, "scene": {**image.spec["scene"], "drop": plan.drop}},
-    )
+    spec = image.record["spec"]
+    record: ImageRecord = {
+        **image.record,
+        "coco": [{**annotation, "image_id": plan.im_id} for annotation in image.record["coco"]],
+        "spec": {**spec, "image_id": plan.im_id, "scene": {**spec["scene"], "drop": plan.drop}},
+    }
+    files = {name.replace(f"/{old}", f"/{new}"): content for name, content in image.files.items()}
+    return FinishedImage(plan, files, record)
 
 
 def _cpu_s() -> float:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from synthetless.scenes.spec import Intrinsics, View
+from synthetless.scenes.spec import Intrinsics, Pose, View
 
 _SENSOR_WIDTH_MM = 36.0
 _CV_TO_BLENDER = np.diag([1.0, -1.0, -1.0])
@@ -36,6 +37,12 @@ def extrinsics(view: View, centre_m: ArrayLike) -> tuple[NDArray[np.float64], ND
     R_w2c = np.stack([cos * right + sin * down, cos * down - sin * right, forward])
     position = np.asarray(centre_m, dtype=np.float64) + view.aim_offset_m + view.distance_m * outwards
     return R_w2c, -R_w2c @ position
+
+
+def settled_centre(settled: Sequence[Pose]) -> NDArray[np.float64]:
+    """(3,) mean of the positions of objects at rest, metres: the point that a view's aim is offset from."""
+    mean: NDArray[np.float64] = np.array([pose.position_m for pose in settled], dtype=np.float64).mean(axis=0)
+    return mean
 
 
 def place(camera: Any, R_w2c: NDArray[np.float64], t_w2c_m: NDArray[np.float64]) -> None:

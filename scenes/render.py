@@ -72,7 +72,7 @@ class BlenderSession:
         """
         bpy_scene = self.bpy.context.scene
         collection = bpy_scene.collection
-        centre_m = centre(settled)
+        centre_m = camera.settled_centre(settled)
         try:
             lights.add_ambient(self.bpy, bpy_scene, spec.ambient)
             lights.add_lamp(self.bpy, collection, spec.light, centre_m)
@@ -142,12 +142,6 @@ class BlenderScene:
             with blender.console_to(self.session.log):
                 self.session.bpy.ops.render.render(write_still=True)
             return read_exr(file)
-
-
-def centre(settled: Sequence[Pose]) -> NDArray[np.float64]:
-    """(3,) mean of the objects' positions, metres."""
-    mean: NDArray[np.float64] = np.array([pose.position_m for pose in settled], dtype=np.float64).mean(axis=0)
-    return mean
 
 
 def read_exr(file: Path) -> NDArray[np.float32]:

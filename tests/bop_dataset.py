@@ -97,7 +97,7 @@ def build_dataset() -> BuildDataset:
 
     def build(root: Path, extension: str = "png") -> Path:
         generator = np.random.default_rng(7)
-        caster = RayCaster({obj_id: (mesh.vertices, mesh.faces) for obj_id, mesh in MESHES.items()})
+        caster = RayCaster({("model", obj_id): (mesh.vertices, mesh.faces) for obj_id, mesh in MESHES.items()})
         for scene_id in range(1, SCENES + 1):
             _write_scene(ScenePaths.of(root, scene_id), caster, generator, extension)
         write_json(root / CAMERA_FILE, records.camera_json(CAMERA, DEPTH_SCALE))

@@ -12,7 +12,7 @@ from synthetless.config import load_recipe
 from synthetless.dataset import records
 from synthetless.dataset.layout import plan_image
 from synthetless.dataset.records import Entry
-from synthetless.dataset.store import Dataset, FinishedImage
+from synthetless.dataset.store import DatasetStore, FinishedImage
 from synthetless.io.models import ObjectModel
 
 K = np.array([[1075.65, 0.0, 360.0], [0.0, 1073.9, 270.0], [0.0, 0.0, 1.0]])
@@ -34,12 +34,14 @@ def random_camera(rng: np.random.Generator) -> Entry:
     return records.camera_entry(K @ focal, np.eye(3), np.array([0.0, 0.0, 700.0]), 0.1)
 
 
-def open_dataset(root: Path, models: Mapping[int, ObjectModel], images: int = 2001) -> Dataset:
+def open_dataset(root: Path, models: Mapping[int, ObjectModel], images: int = 2001) -> DatasetStore:
     """Begin a dataset, or go on with one."""
-    return Dataset.open(root, load_recipe(None, [f"images={images}", "outputs=[rgb]"]), models, "")
+    return DatasetStore.open(root, load_recipe(None, [f"images={images}", "outputs=[rgb]"]), models, "")
 
 
-def commit(dataset: Dataset, obj_ids: Sequence[int], numbers: Iterable[int] = NUMBERS, instances: int = 12) -> None:
+def commit(
+    dataset: DatasetStore, obj_ids: Sequence[int], numbers: Iterable[int] = NUMBERS, instances: int = 12
+) -> None:
     """Put images on disk; each follows from its number."""
     info: Entry = {"px_count_all": 9, "px_count_valid": 9, "px_count_visib": 9, "visib_fract": 1.0}
     info |= {"bbox_obj": [1, 1, 3, 3], "bbox_visib": [1, 1, 3, 3]}
@@ -48,4 +50,5 @@ def commit(dataset: Dataset, obj_ids: Sequence[int], numbers: Iterable[int] = NU
         files = {f"rgb/{plan.im_id:06d}.png": f"picture {number}".encode()}
         gt = random_poses(rng, obj_ids, instances)
         spec = {"image_id": plan.im_id}
-        dataset.commit(FinishedImage(plan, files, random_camera(rng), gt, [info] * instances, [], spec))
+        record = {"camera": random_camera(rng), "gt": gt, "gt_info": [info] * instances, "coco": [], "spec": spec}
+        dataset.commit(FinishedImage(plan, files, record))

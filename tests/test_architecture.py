@@ -107,6 +107,7 @@ def test_importing_the_package_works_beside_files_of_the_same_names(tmp_path: Pa
         "import generator, scenes, assets\n"
         "assert generator.MINE and scenes.MINE and assets.MINE\n"
         "from synthetless.symmetry import CanonicalMap, SymmetryGroup, SymmetryTable\n"
+        "from synthetless.dataset import Dataset\n"
         "import synthetless.scenes.spec, synthetless.assets\n"
         "print(SymmetryGroup.from_name('C2').name)\n"
     )

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,20 +14,17 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from synthetless.annotation.instances import ImageAnnotation, PosedModel
-from synthetless.annotation.raycast import Occluder, Plane, RayCaster
+from synthetless.annotation.raycast import Plane
+from synthetless.annotation.scene import annotate_scene, scene_caster
 from synthetless.config import Recipe, load_recipe
 from synthetless.dataset import records
 from synthetless.dataset.layout import ImagePlan, ScenePaths, by_drop, scene_ids
-from synthetless.dataset.store import Dataset, FinishedImage
-from synthetless.generation.drop import encode
-from synthetless.generation.rerender import read_recipe
-from synthetless.io.images import has_depth
+from synthetless.dataset.reader import read_recipe
+from synthetless.dataset.store import DatasetStore, FinishedImage
 from synthetless.io.models import ObjectModel, load_models
-from synthetless.scenes.camera import extrinsics
-from synthetless.scenes.render import centre
 from synthetless.scenes.rotations import matrix
 from synthetless.scenes.sampling import Catalogue, sample_scene
-from synthetless.scenes.spec import Pose, SceneSpec
+from synthetless.scenes.spec import Pose, Role, SceneSpec
 
 IMAGES, IMAGES_PER_SCENE = 6, 3
 RECIPE = (
@@ -95,11 +90,11 @@ def small_scene_folders() -> Iterator[None]:
 
 
 @small_scene_folders()
-def write_dataset(root: Path, models_folder: Path, overrides: Sequence[str] = (), seed: int = 5) -> Dataset:
+def write_dataset(root: Path, models_folder: Path, overrides: Sequence[str] = (), seed: int = 5) -> DatasetStore:
     """A complete dataset of random colours and true everything else."""
     recipe = load_recipe(None, [*RECIPE, f"seed={seed}", *overrides])
     maker = _Maker(recipe, load_models(models_folder))
-    dataset = Dataset.open(root, recipe, maker.models, "")
+    dataset = DatasetStore.open(root, recipe, maker.models, "")
     for drop, plans in by_drop(range(recipe.images), recipe.camera.views_per_drop):
         for image in maker.make(drop, plans):
             dataset.commit(image)
@@ -110,7 +105,7 @@ def write_dataset(root: Path, models_folder: Path, overrides: Sequence[str] = ()
 def ray_cast(root: Path, models_folder: Path) -> dict[tuple[int, int], ImageAnnotation]:
     """What ray casting says of each image, by scene folder and image id, from its camera and poses."""
     models = load_models(models_folder)
-    caster = RayCaster({obj_id: (model.vertices_mm, model.faces) for obj_id, model in models.items()})
+    caster = scene_caster({"model": models})
     recipe = read_recipe(root)
     seen = {}
     for scene_id in scene_ids(root):
@@ -135,9 +130,8 @@ class _Maker:
         distractors: Mapping[int, ObjectModel] = {}
         if recipe.source.distractors is not None:
             distractors = load_models(Path(recipe.source.distractors))
-        self._of_role = {"model": models, "distractor": distractors}
-        meshes = {self._key(role, i): m for role, of in self._of_role.items() for i, m in of.items()}
-        self._caster = RayCaster({key: (model.vertices_mm, model.faces) for key, model in meshes.items()})
+        self._of_role: dict[Role, Mapping[int, ObjectModel]] = {"model": models, "distractor": distractors}
+        self._caster = scene_caster(self._of_role)
 
     def make(self, drop: int, plans: Sequence[ImagePlan]) -> list[FinishedImage]:
         models, distractors = ({i: m.diameter_mm / 1000 for i, m in of.items()} for of in self._of_role.values())
@@ -157,42 +151,7 @@ class _Maker:
         return tuple(poses)
 
     def _image(self, plan: ImagePlan, spec: SceneSpec, settled: tuple[Pose, ...]) -> FinishedImage:
-        recipe, camera = self._recipe, self._recipe.intrinsics
-        R_w2c, t_w2c_m = extrinsics(spec.views[plan.view], centre(settled))
-        t_w2c = 1000 * t_w2c_m
-        poses = [(R_w2c @ matrix(p.rotation_wxyz), R_w2c @ (1000 * np.array(p.position_m)) + t_w2c) for p in settled]
-        items = list(enumerate(zip(spec.objects, poses, strict=True)))
-        models = {n: PosedModel(item.obj_id, *pose) for n, (item, pose) in items if item.role == "model"}
-        balls = [
-            Occluder(self._key(item.role, item.obj_id), *pose) for _, (item, pose) in items if item.role != "model"
-        ]
-        plane = Plane(R_w2c, t_w2c, recipe.table.size_m * 500)
-        delta, outputs = recipe.labels.visibility_delta_mm, recipe.outputs
-        extra = "normals" in outputs, "object_coordinates" in outputs
-        seen = self._caster.annotate(camera, plane, list(models.values()), balls, delta, *extra)
-        shown = [n for n, instance in zip(models, seen.instances, strict=True) if instance.mask.any()]
-        seen = self._caster.annotate(camera, plane, [models[n] for n in shown], balls, delta, *extra)
-        if "depth" in outputs:
-            seen = seen.where_valid(has_depth(seen.depth_mm, recipe.encoding.depth_scale))
-        rng = np.random.default_rng([plan.number, 1])
-        rgb = rng.integers(0, 256, (camera.height, camera.width, 3), dtype=np.uint8)
-        return FinishedImage(
-            plan,
-            encode(recipe, plan, seen, rgb, (rgb / 255).astype(np.float32)),
-            records.camera_entry(records.camera_matrix(camera), R_w2c, t_w2c, recipe.encoding.depth_scale),
-            [records.gt_entry(models[n].obj_id, models[n].R_m2c, models[n].t_m2c) for n in shown],
-            [records.gt_info_entry(instance) for instance in seen.instances],
-            records.coco_annotations(plan.im_id, [models[n].obj_id for n in shown], seen.instances),
-            {
-                "image_id": plan.im_id,
-                "view": plan.view,
-                "exposure_gain": math.sqrt(2),
-                "instances": shown,
-                "scene": asdict(spec),
-                "settled": [asdict(pose) for pose in settled],
-            },
-        )
-
-    @staticmethod
-    def _key(role: str, obj_id: int) -> Any:
-        return obj_id if role == "model" else (role, obj_id)
+        camera = self._recipe.camera
+        light = np.random.default_rng([plan.number, 1]).random((camera.height, camera.width, 3)).astype(np.float32)
+        annotated = annotate_scene(self._caster, self._recipe, spec, settled, plan.view)
+        return FinishedImage.of(self._recipe, plan, spec, settled, annotated, light)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from synthetless.annotation.instances import PosedModel
-from synthetless.annotation.raycast import RayCaster
+from synthetless.annotation.scene import scene_caster
 from synthetless.io.models import ObjectModel, load_models
 from synthetless.scenes.spec import Intrinsics
 from synthetless.symmetry import CanonicalMap, CanonicalPoses, SymmetryGroup
@@ -179,7 +179,7 @@ def _draw_part(axes: Axes, part: ObjectModel, view: Floats, element: int) -> Non
     motion = group.motions()[element]
     t_view = np.array([0.0, 0.0, 2.6 * part.diameter_mm])
     R, t = view @ motion[:3, :3], view @ motion[:3, 3] + t_view
-    caster = RayCaster({part.obj_id: (part.vertices_mm, part.faces)})
+    caster = scene_caster({"model": {part.obj_id: part}})
     seen = caster.annotate(camera, None, [PosedModel(part.obj_id, R, t)], normals=True)
     assert seen.normals is not None
     light = np.array([-0.35, -0.75, -0.56])

@@ -12,9 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetless.scenes.spec import Intrinsics
+from synthetless.scenes.spec import Intrinsics, Role
 
 Box = tuple[int, int, int, int]
+MeshKey = tuple[Role, int]
+"""A mesh among those of a scene: the role of its models folder, and its object id there."""
 
 BACKGROUND = -1
 """Instance id of a pixel that shows the table, a distractor or nothing."""
@@ -28,11 +30,18 @@ class PosedModel:
         obj_id: the model's BOP id.
         R_m2c: (3, 3) float64 rotation, model to camera (OpenCV: x right, y down, z forward).
         t_m2c: (3,) float64 translation, millimetres.
+        role: "model" if it may get labels; a distractor is of another models folder.
     """
 
     obj_id: int
     R_m2c: NDArray[np.float64]
     t_m2c: NDArray[np.float64]
+    role: Role = "model"
+
+    @property
+    def key(self) -> MeshKey:
+        """Of its mesh."""
+        return self.role, self.obj_id
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,10 +7,9 @@ triangle, double precision the point on it. The table is intersected in closed f
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -23,6 +22,7 @@ from synthetless.annotation.instances import (
     BACKGROUND,
     ImageAnnotation,
     InstanceAnnotation,
+    MeshKey,
     PosedModel,
     Window,
     canvas_window,
@@ -292,44 +292,28 @@ class Plane:
         return met
 
 
-@dataclass(frozen=True, eq=False)
-class Occluder:
-    """A mesh that hides what is behind it but has no label.
-
-    Attributes:
-        key: of its mesh.
-        R_m2c: (3, 3) rotation, model to camera.
-        t_m2c: (3,) translation, millimetres.
-    """
-
-    key: Hashable
-    R_m2c: NDArray[np.float64]
-    t_m2c: NDArray[np.float64]
-
-
 class RayCaster:
     """Casts rays at a set of meshes and keeps the tree of each that was posed.
 
     It uses one thread. It cannot be pickled, nor used on both sides of a fork: give each process its own.
     """
 
-    def __init__(self, meshes: Mapping[Any, tuple[ArrayLike, ArrayLike]]) -> None:
+    def __init__(self, meshes: Mapping[MeshKey, tuple[ArrayLike, ArrayLike]]) -> None:
         """Take the meshes; a tree is built when its mesh is first posed.
 
         Args:
-            meshes: vertices (V, 3) in millimetres, model frame, and faces (F, 3), by key: the BOP id for objects that
-                get labels, anything for occluders.
+            meshes: vertices (V, 3) in millimetres, model frame, and faces (F, 3), by role and object id.
         """
         self._meshes = meshes
         self._device = EmbreeDevice()
-        self._surfaces: dict[Hashable, Surface] = {}
+        self._surfaces: dict[MeshKey, Surface] = {}
 
     def annotate(
         self,
         camera: Intrinsics,
         plane: Plane | None,
         instances: Sequence[PosedModel],
-        occluders: Sequence[Occluder] = (),
+        occluders: Sequence[PosedModel] = (),
         visibility_delta_mm: float = 0.0,
         normals: bool = False,
         object_coordinates: bool = False,
@@ -339,7 +323,7 @@ class RayCaster:
         Args:
             camera: the pinhole.
             plane: the table, or None.
-            instances: what gets labels; ``obj_id`` is the key of its mesh.
+            instances: what gets labels.
             occluders: what hides, but gets none.
             visibility_delta_mm: how far behind the nearest surface a point still counts as visible, along the ray, as
                 bop_toolkit has it. With 0 an instance is visible exactly where it is the nearest surface.
@@ -347,13 +331,14 @@ class RayCaster:
             object_coordinates: also give the object coordinates.
 
         Raises:
-            UserError: the tolerance is negative, or a mesh is unknown or unusable.
+            ValueError: the tolerance is negative, or a mesh is unknown.
+            UserError: a mesh is unusable.
         """
         if not visibility_delta_mm >= 0:
-            raise UserError(f"visibility_delta_mm is {visibility_delta_mm}; a number >= 0 is needed")
+            raise ValueError(f"visibility_delta_mm is {visibility_delta_mm}; a number >= 0 is needed")
         image, canvas = image_window(camera), canvas_window(camera)
-        hits = [self._cast(camera, posed.obj_id, posed.R_m2c, posed.t_m2c, canvas) for posed in instances]
-        hits += [self._cast(camera, posed.key, posed.R_m2c, posed.t_m2c, image) for posed in occluders]
+        hits = [self._cast(camera, posed, canvas) for posed in instances]
+        hits += [self._cast(camera, posed, image) for posed in occluders]
         scene = _NearestSurface(camera, hits, plane)
         return ImageAnnotation(
             depth_mm=np.where(np.isfinite(scene.depth_mm), scene.depth_mm, 0.0),
@@ -363,8 +348,8 @@ class RayCaster:
             object_coordinates_mm=scene.object_coordinates_mm(len(instances)) if object_coordinates else None,
         )
 
-    def _cast(self, camera: Intrinsics, key: Hashable, R_m2c: ArrayLike, t_m2c: ArrayLike, limits: Window) -> _Hits:
-        body = PosedSurface.of(self._surface(key), R_m2c, t_m2c)
+    def _cast(self, camera: Intrinsics, posed: PosedModel, limits: Window) -> _Hits:
+        body = PosedSurface.of(self._surface(posed.key), posed.R_m2c, posed.t_m2c)
         window = limits.intersection(body.window(camera))
         faces = body.first_faces(Rays.through(camera, window))
         inside = image_window(camera).intersection(window)
@@ -372,14 +357,14 @@ class RayCaster:
         faces_inside = faces[inside.slices_in(window)]
         return _Hits(body, window, faces != MISS, rays, faces_inside, body.depth_mm(rays, faces_inside))
 
-    def _surface(self, key: Hashable) -> Surface:
+    def _surface(self, key: MeshKey) -> Surface:
         if key not in self._surfaces:
             if key not in self._meshes:
-                raise UserError(f"no mesh for object {key!r}; there are {', '.join(map(repr, self._meshes))}")
+                raise ValueError(f"no mesh for {_name(key)}; there are {', '.join(map(_name, self._meshes))}")
             try:
                 self._surfaces[key] = Surface(self._device, *self._meshes[key])
             except ValueError as error:
-                raise UserError(f"object {key!r}: {error}") from None
+                raise UserError(f"{_name(key)}: {error}") from None
         return self._surfaces[key]
 
 
@@ -466,3 +451,8 @@ def _along(axis: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.floa
     """(h, w) component of the rays (x, y, 1) of a grid along an axis of the camera frame."""
     component: NDArray[np.float64] = x * axis[0] + (y * axis[1] + axis[2])[:, None]
     return component
+
+
+def _name(key: MeshKey) -> str:
+    role, obj_id = key
+    return f"{'object' if role == 'model' else role} {obj_id}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -85,6 +86,9 @@ def generate_command(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Only tell what it would take; two images are made to measure.")
     ] = False,
+    no_cache: Annotated[
+        bool, typer.Option("--no-cache", help="Compute meshes' colliders anew, and keep nothing in the cache folder.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Make a dataset: drop, render, measure, label, write.
@@ -96,7 +100,10 @@ def generate_command(
     from synthetless.generation import devices
     from synthetless.generation.estimate import estimate
     from synthetless.generation.generate import Execution, generate
+    from synthetless.io.cache import CACHE_VARIABLE
 
+    if no_cache:
+        os.environ[CACHE_VARIABLE] = "off"  # for the workers, too, which inherit it
     resolved = _resolve(recipe, overrides or [], images, seed, models, textures)
     if address is not None and executor != "ray":
         raise UserError(f"--address {address} is of a Ray cluster; add --executor ray")
@@ -192,10 +199,10 @@ def redo_command(
     It is made alone, in the foreground, and put where it is missing.
     """
     from synthetless.generation.drop import DropFailed
-    from synthetless.generation.generate import redo
+    from synthetless.generation.generate import retry
 
     try:
-        made = redo(dataset, drop, textures)
+        made = retry(dataset, drop, textures)
     except DropFailed as failure:
         leave(f"drop {drop}: {failure}", EXIT_FAILED)
     say(f"drop {drop}: {made} images in {dataset}")

@@ -51,7 +51,7 @@ def adopt_command(
     scheme: SchemeOption = None,
 ) -> None:
     """Label an existing BOP dataset; its own files stay as they are."""
-    from synthetless.dataset.adopt import adopt
+    from synthetless.dataset.relabel import adopt
 
     say(adopt(dataset, models, symmetries, scheme))
 

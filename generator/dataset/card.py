@@ -16,7 +16,7 @@ import yaml
 
 from synthetless.config import BUILTIN, Recipe
 from synthetless.dataset.layout import CARD_FILE, DATASET_FILE, SYMMETRIES_FILE, ScenePaths, scene_ids
-from synthetless.dataset.reader import read_scene
+from synthetless.dataset.reader import read_entries
 from synthetless.io.files import atomic_write, read_json
 from synthetless.symmetry import SymmetryTable
 
@@ -106,7 +106,7 @@ def escape(text: str) -> str:
 def _count(dataset: Path, split: str) -> Statistics:
     images, objects = 0, defaultdict[int, ObjectStatistics](ObjectStatistics)
     for scene_id in scene_ids(dataset, split) if (dataset / split).is_dir() else ():
-        for labels in read_scene(ScenePaths.of(dataset, scene_id, split)):
+        for labels in read_entries(ScenePaths.of(dataset, scene_id, split)):
             images += 1
             for info, label in zip(labels.gt_info, labels.gt_canonical, strict=True):
                 of_object = objects[label["obj_id"]]

@@ -13,10 +13,15 @@ from itertools import groupby
 from pathlib import Path
 
 from synthetless.errors import UserError
+from synthetless.io.models import INFO_FILE
 
 DATASET_FILE = "dataset.json"
 SYMMETRIES_FILE = "symmetries.json"
+PENDING_FILE = ".symmetries.json"
+"""While labels are being replaced: the symmetry table that the new ones are of."""
 CAMERA_FILE = "camera.json"
+DRAFT_FOLDER = ".relabel.draft"
+"""New labels, until all of them are made."""
 CARD_FILE = "README.md"
 SHEET_FILE = "preview.jpg"
 MODELS_FOLDER = "models"
@@ -24,6 +29,7 @@ RECORDS_FOLDER = ".records"
 FAILURES_FOLDER = ".failures"
 LOGS_FOLDER = ".logs"
 SPLIT = "train_synthetless"
+_MODELS_FOLDERS = (MODELS_FOLDER, "models_cad", "models_eval")
 
 IMAGES_PER_SCENE = 1000
 FIRST_SCENE = 1
@@ -103,6 +109,10 @@ class ScenePaths:
     def rgb(self, im_id: int, extension: str = "png") -> Path:
         return self.root / "rgb" / f"{im_id:06d}.{extension}"
 
+    def find_rgb(self, im_id: int) -> Path | None:
+        """The colour image in whichever format there is; None if there is none."""
+        return next((path for path in (self.rgb(im_id, "png"), self.rgb(im_id, "jpg")) if path.exists()), None)
+
     def depth(self, im_id: int) -> Path:
         return self.root / "depth" / f"{im_id:06d}.png"
 
@@ -175,3 +185,21 @@ def scene_ids(dataset: Path, split: str = SPLIT) -> list[int]:
     if not ids:
         raise UserError(f"{folder}: holds no scene folders (000001, ...)")
     return ids
+
+
+def scene_folders(root: Path, having: Iterable[str]) -> list[ScenePaths]:
+    """The scene folders SPLIT/%06d of all splits that have one of these files, in order."""
+    folders = {path.parent for name in having for path in root.glob(f"*/*/{name}")}
+    return [ScenePaths(folder) for folder in sorted(folders) if folder.name.isdecimal()]
+
+
+def find_models_folder(root: Path) -> Path:
+    """The folder with the models_info.json of a BOP dataset.
+
+    Raises:
+        UserError: there is none in any of the places where BOP has it.
+    """
+    for name in _MODELS_FOLDERS:
+        if (root / name / INFO_FILE).exists():
+            return root / name
+    raise UserError(f"{root}: holds no {INFO_FILE} in {', '.join(_MODELS_FOLDERS)}; name the models folder")

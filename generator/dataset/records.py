@@ -1,26 +1,222 @@
-"""BOP's scenewise layout: where the files of a scene are, and what an image's entry in each of them says.
+"""The records of an image: what each JSON file of a scene folder says of it, declared once.
 
-Format: https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md
+A record is plain JSON data. Its type is the schema that readers and the validator hold it against, and the function
+beside it makes one of what was measured. BOP's format:
+https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, with_config
+from typing_extensions import TypedDict
 
 from synthetless.annotation.instances import InstanceAnnotation
 from synthetless.errors import UserError
 from synthetless.io.files import read_json, write_json
-from synthetless.scenes.spec import Intrinsics
+from synthetless.scenes.spec import Intrinsics, Pose, SceneSpec
 
 MIN_VISIB_FRACT = 0.1
 """Instances with a smaller visible fraction are marked ``ignore`` in scene_gt_coco.json, as bop_toolkit does."""
 
+_EXACT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+_OPEN = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False)
+
+Number = Annotated[float, Field(ge=-1e12, le=1e12)]
+NotNegative = Annotated[float, Field(ge=0, le=1e12)]
+Positive = Annotated[float, Field(gt=0, le=1e12)]
+Count = Annotated[int, Field(ge=0)]
+Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Matrix = Annotated[list[Number], Field(min_length=9, max_length=9)]
 Entry = dict[str, Any]
+ModelInfo = Mapping[str, Any]
+"""An object's entry in models_info.json."""
+BoxList = Annotated[list[int], Field(min_length=4, max_length=4)]
+Point = Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
+@with_config(_EXACT)
+class CameraEntry(TypedDict):
+    """An image in scene_camera.json: camera matrix (row-wise, pixels), world to camera (mm), mm per unit of depth."""
+
+    cam_K: Matrix
+    cam_R_w2c: Matrix
+    cam_t_w2c: Vector
+    depth_scale: Positive
+
+
+@with_config(_EXACT)
+class GtEntry(TypedDict):
+    """An instance in scene_gt.json: its pose, model to camera (row-wise; mm)."""
+
+    cam_R_m2c: Matrix
+    cam_t_m2c: Vector
+    obj_id: Count
+
+
+@with_config(_EXACT)
+class GtInfoEntry(TypedDict):
+    """An instance in scene_gt_info.json, counted as ``annotation.instances.InstanceAnnotation`` says."""
+
+    bbox_obj: BoxList
+    bbox_visib: BoxList
+    px_count_all: Count
+    px_count_valid: Count
+    px_count_visib: Count
+    visib_fract: NotNegative
+
+
+@with_config(_EXACT)
+class CanonicalEntry(TypedDict):
+    """An instance in scene_gt_canonical.json: what a network learns of it."""
+
+    obj_id: Count
+    cam_R_m2c_canonical: Matrix
+    cam_t_m2c_canonical: Vector
+    regressor_index: Count
+    n_regressors: Annotated[int, Field(ge=1)]
+    discontinuity_margin_deg: NotNegative
+    bbox3d_corners_2d: Annotated[list[Point], Field(min_length=8, max_length=8)]
+
+
+@with_config(_OPEN)
+class ForeignCameraEntry(TypedDict):
+    """An image in somebody else's scene_camera.json, which may say more, or not where the camera stands."""
+
+    cam_K: Matrix
+    depth_scale: NotRequired[Positive]
+
+
+@with_config(_OPEN)
+class ForeignGtEntry(TypedDict):
+    """An instance in somebody else's scene_gt.json, which may say more."""
+
+    cam_R_m2c: Matrix
+    cam_t_m2c: Vector
+    obj_id: Count
+
+
+@with_config(_OPEN)
+class ForeignGtInfoEntry(TypedDict):
+    """An instance in somebody else's scene_gt_info.json, which may say more."""
+
+    bbox_obj: BoxList
+    bbox_visib: BoxList
+    px_count_all: Count
+    px_count_valid: Count
+    px_count_visib: Count
+    visib_fract: NotNegative
+
+
+@with_config(_EXACT)
+class RunLengths(TypedDict):
+    """COCO's uncompressed run lengths, column by column, the first outside the mask; ``size`` is [rows, columns]."""
+
+    counts: list[Count]
+    size: Annotated[list[Count], Field(min_length=2, max_length=2)]
+
+
+@with_config(_EXACT)
+class CocoAnnotation(TypedDict):
+    """An instance in scene_gt_coco.json; ``id`` is counted when a scene folder's images are put together."""
+
+    id: NotRequired[Count]
+    image_id: Count
+    category_id: Count
+    iscrowd: int
+    area: Count
+    bbox: BoxList
+    segmentation: RunLengths
+    ignore: bool
+    width: Count
+    height: Count
+
+
+@with_config(_EXACT)
+class CocoImage(TypedDict):
+    """An image in scene_gt_coco.json."""
+
+    id: Count
+    file_name: str
+    width: Count
+    height: Count
+    license: int
+    coco_url: str
+    flickr_url: str
+    date_captured: str
+
+
+@with_config(_EXACT)
+class CocoCategory(TypedDict):
+    """An object in scene_gt_coco.json."""
+
+    id: Count
+    name: str
+    supercategory: str
+
+
+@with_config(_EXACT)
+class CocoFile(TypedDict):
+    """scene_gt_coco.json."""
+
+    annotations: list[CocoAnnotation]
+    categories: list[CocoCategory]
+    images: list[CocoImage]
+    info: dict[str, str]
+    licenses: list[Any]
+
+
+@with_config(_EXACT)
+class CameraFile(TypedDict):
+    """camera.json: the size and intrinsics of all images, pixels, and mm per unit of depth."""
+
+    width: Count
+    height: Count
+    fx: Positive
+    fy: Positive
+    cx: Number
+    cy: Number
+    depth_scale: Positive
+
+
+@dataclass(frozen=True)
+class ImageSpec:
+    """A line of scene_spec.jsonl: everything needed to make the image again.
+
+    Attributes:
+        image_id: BOP image id within its scene folder.
+        view: which of the scene's views it shows.
+        exposure_gain: what the linear image was multiplied by.
+        instances: number in ``scene.objects`` of each labelled instance, in scene_gt's order.
+        scene: what was built.
+        settled: pose of each object at rest.
+    """
+
+    image_id: int
+    view: int
+    exposure_gain: float
+    instances: tuple[int, ...]
+    scene: SceneSpec
+    settled: tuple[Pose, ...]
+
+
+class ImageRecord(TypedDict):
+    """An image's record, .records/SCENE/IMAGE.json, from which its entries in the scene folder's files are assembled.
+
+    ``spec`` is an ``ImageSpec`` as JSON data.
+    """
+
+    camera: CameraEntry
+    gt: list[GtEntry]
+    gt_info: list[GtInfoEntry]
+    coco: list[CocoAnnotation]
+    spec: dict[str, Any]
 
 
 def write_scene_json(path: Path, entries: Mapping[int, Any]) -> None:
@@ -54,7 +250,7 @@ def camera_matrix(intrinsics: Intrinsics) -> NDArray[np.float64]:
     )
 
 
-def camera_json(intrinsics: Intrinsics, depth_scale: float) -> Entry:
+def camera_json(intrinsics: Intrinsics, depth_scale: float) -> CameraFile:
     """The content of a dataset's camera.json; ``depth_scale`` is mm per unit of a depth image."""
     return {
         "cx": intrinsics.cx,
@@ -69,7 +265,7 @@ def camera_json(intrinsics: Intrinsics, depth_scale: float) -> Entry:
 
 def camera_entry(
     K: NDArray[np.float64], R_w2c: NDArray[np.float64], t_w2c: NDArray[np.float64], depth_scale: float
-) -> Entry:
+) -> CameraEntry:
     """An image's entry in scene_camera.json.
 
     Args:
@@ -86,12 +282,12 @@ def camera_entry(
     }
 
 
-def gt_entry(obj_id: int, R_m2c: NDArray[np.float64], t_m2c: NDArray[np.float64]) -> Entry:
+def gt_entry(obj_id: int, R_m2c: NDArray[np.float64], t_m2c: NDArray[np.float64]) -> GtEntry:
     """An instance's entry in scene_gt.json: (3, 3) rotation and (3,) translation in mm, model to camera."""
     return {"cam_R_m2c": _floats(R_m2c, 9), "cam_t_m2c": _floats(t_m2c, 3), "obj_id": int(obj_id)}
 
 
-def gt_info_entry(instance: InstanceAnnotation) -> Entry:
+def gt_info_entry(instance: InstanceAnnotation) -> GtInfoEntry:
     """An instance's entry in scene_gt_info.json."""
     return {
         "bbox_obj": [int(value) for value in instance.bbox_obj],
@@ -103,7 +299,7 @@ def gt_info_entry(instance: InstanceAnnotation) -> Entry:
     }
 
 
-def uncompressed_rle(mask: NDArray[np.bool_]) -> Entry:
+def uncompressed_rle(mask: NDArray[np.bool_]) -> RunLengths:
     """COCO's uncompressed run lengths, which BOP's files use: column by column, first run outside the mask.
 
     pycocotools writes compressed runs only, which BOP's own readers of mask.json do not all take.
@@ -126,7 +322,9 @@ def amodal_box(mask: NDArray[np.bool_]) -> list[int]:
     return [x, y, int(columns[-1]) - x + 1, int(rows[-1]) - y + 1]
 
 
-def coco_annotations(im_id: int, obj_ids: Sequence[int], instances: Sequence[InstanceAnnotation]) -> list[Entry]:
+def coco_annotations(
+    im_id: int, obj_ids: Sequence[int], instances: Sequence[InstanceAnnotation]
+) -> list[CocoAnnotation]:
     """An image's annotations for scene_gt_coco.json, without their ids, which ``scene_gt_coco`` counts.
 
     The box is amodal, inside the image. Instances of which nothing is visible are left out.
@@ -153,7 +351,7 @@ def coco_annotations(im_id: int, obj_ids: Sequence[int], instances: Sequence[Ins
     ]
 
 
-def coco_image(im_id: int, rgb: Path, width: int, height: int) -> Entry:
+def coco_image(im_id: int, rgb: Path, width: int, height: int) -> CocoImage:
     """An image's entry in scene_gt_coco.json; ``rgb`` is its file, SCENE/rgb/NAME."""
     return {
         "coco_url": "",
@@ -168,8 +366,8 @@ def coco_image(im_id: int, rgb: Path, width: int, height: int) -> Entry:
 
 
 def scene_gt_coco(
-    dataset_name: str, obj_ids: Iterable[int], images: Iterable[Entry], annotations: Iterable[Entry]
-) -> Entry:
+    dataset_name: str, obj_ids: Iterable[int], images: Iterable[CocoImage], annotations: Iterable[CocoAnnotation]
+) -> CocoFile:
     """The content of scene_gt_coco.json, for ``synthetless.io.files.write_json``.
 
     Args:

@@ -1,4 +1,4 @@
-"""A dataset on disk that can be left at any moment and gone on with.
+"""A dataset on disk that can be left at any moment and continued.
 
 An image exists when its record does: the files of an image are written first, each beside its place and renamed, its
 record last. The JSON files of a scene folder are a function of its records and of symmetries.json; ``assemble`` writes
@@ -7,33 +7,46 @@ them, at any time and as often as one likes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
+from numpy.typing import NDArray
+
+from synthetless.annotation.instances import ImageAnnotation
+from synthetless.annotation.scene import AnnotatedScene
 from synthetless.config import Recipe, dump_recipe
 from synthetless.dataset import records
 from synthetless.dataset.card import write_card
-from synthetless.dataset.changes import complete
-from synthetless.dataset.labels import label_scene
+from synthetless.dataset.labels import LabelState, describe_symmetries, is_half_labelled, label_scene
 from synthetless.dataset.layout import (
     CAMERA_FILE,
     DATASET_FILE,
+    DRAFT_FOLDER,
     MODELS_FOLDER,
+    PENDING_FILE,
     RECORDS_FOLDER,
     SYMMETRIES_FILE,
     ImagePlan,
     ScenePaths,
     image_number,
 )
-from synthetless.dataset.records import Entry
+from synthetless.dataset.reader import read_recipe
+from synthetless.dataset.records import CocoFile, GtEntry, ImageRecord, ImageSpec, ModelInfo
 from synthetless.errors import UserError
-from synthetless.io.files import atomic_write, in_turn, read_json, write_json, write_json_lines
+from synthetless.io import images
+from synthetless.io.color import exposure_gain, tonemap
+from synthetless.io.files import atomic_write, in_turn, read_json, replace_file, write_json, write_json_lines
 from synthetless.io.models import INFO_FILE, ObjectModel
+from synthetless.scenes.spec import Pose, SceneSpec
 from synthetless.symmetry import SymmetryTable
 
+_SIX_DIGITS = re.compile(r"\d{6}")
 _MAY_CHANGE = ("images", "name", "source")
 """Settings that a dataset may be continued under another value of: the sources are compared by their content."""
 
@@ -49,29 +62,80 @@ class FinishedImage:
     Attributes:
         plan: which one it is.
         files: encoded content by the file's path inside the scene folder.
-        camera, gt, gt_info, coco: BOP's entries for it.
-        spec: everything needed to render it again.
+        record: what the scene folder's JSON files are assembled from.
     """
 
     plan: ImagePlan
     files: Mapping[str, bytes]
-    camera: Entry
-    gt: list[Entry]
-    gt_info: list[Entry]
-    coco: list[Entry]
-    spec: Entry
+    record: ImageRecord
+
+    @classmethod
+    def of(
+        cls,
+        recipe: Recipe,
+        plan: ImagePlan,
+        scene: SceneSpec,
+        settled: Sequence[Pose],
+        annotated: AnnotatedScene,
+        linear: NDArray[np.float32] | None,
+    ) -> FinishedImage:
+        """Encode what was measured and rendered.
+
+        Args:
+            recipe: which files are written, and how.
+            plan: which image it is.
+            scene, settled: what was built, and the pose at rest of each of its objects.
+            annotated: the planned view of it.
+            linear: (H, W, 3) rendered light, Rec. 709 primaries; None if nothing was rendered.
+        """
+        gain = 1.0 if linear is None else exposure_gain(linear, recipe.render.exposure)
+        rgb = None if linear is None else tonemap(linear, gain)
+        files = _encode(recipe, plan.im_id, annotated.image, rgb, linear)
+        return cls(plan, files, image_record(recipe, plan, scene, settled, annotated, gain))
+
+
+def image_record(
+    recipe: Recipe,
+    plan: ImagePlan,
+    scene: SceneSpec,
+    settled: Sequence[Pose],
+    annotated: AnnotatedScene,
+    exposure_gain: float,
+) -> ImageRecord:
+    """The record of an image; arguments as for ``FinishedImage.of``."""
+    K, scale = records.camera_matrix(recipe.intrinsics), recipe.encoding.depth_scale
+    instances = annotated.image.instances
+    spec = ImageSpec(plan.im_id, plan.view, exposure_gain, annotated.numbers, scene, tuple(settled))
+    return {
+        "camera": records.camera_entry(K, annotated.R_w2c, annotated.t_w2c, scale),
+        "gt": [records.gt_entry(model.obj_id, model.R_m2c, model.t_m2c) for model in annotated.models],
+        "gt_info": [records.gt_info_entry(instance) for instance in instances],
+        "coco": records.coco_annotations(plan.im_id, [model.obj_id for model in annotated.models], instances),
+        "spec": asdict(spec),
+    }
 
 
 @dataclass(frozen=True)
-class Dataset:
+class _Assembled:
+    """A scene folder whose JSON files tell of every record that its folder of records, last changed then, holds."""
+
+    records_changed_ns: int
+    images: int
+    instances: int
+
+
+@dataclass(frozen=True)
+class DatasetStore:
     """A dataset folder and the recipe that fills it."""
 
     root: Path
     recipe: Recipe
+    _assembled: dict[int, _Assembled] = field(default_factory=dict, init=False, compare=False, repr=False)
+    """What this process knows to be assembled: the cost of assembling does not grow with what is finished."""
 
     @classmethod
-    def open(cls, root: Path, recipe: Recipe, models: Mapping[int, ObjectModel], scenery_digest: str) -> Dataset:
-        """Begin a dataset, or go on with one that was made from the same recipe, models and photographs.
+    def open(cls, root: Path, recipe: Recipe, models: Mapping[int, ObjectModel], scenery_digest: str) -> DatasetStore:
+        """Begin a dataset, or continue one that was made from the same recipe, models and photographs.
 
         Raises:
             UserError: the folder holds something else, or cannot be written.
@@ -79,11 +143,11 @@ class Dataset:
         known = root / DATASET_FILE
         header = _header(recipe, models, scenery_digest)
         if known.exists():
-            before = read_json(known)
-            _refuse_other(known, before, header)
-            recipe = recipe.model_copy(update={"images": max(recipe.images, before["recipe"]["images"])})
+            begun_with = read_recipe(root)  # with today's defaults for settings that it did not know
+            _refuse_other(known, {**read_json(known), "recipe": dump_recipe(begun_with)}, header)
+            recipe = recipe.model_copy(update={"images": max(recipe.images, begun_with.images)})
         else:
-            _refuse_foreign(root)
+            make_folder(root)
             write_json(known, header)
         dataset = cls(root, recipe)
         dataset._write_companions(models)
@@ -99,10 +163,7 @@ class Dataset:
 
     def done(self) -> set[int]:
         """Numbers of the images that exist."""
-        return {
-            image_number(int(path.parent.name), int(path.stem))
-            for path in (self.root / RECORDS_FOLDER).glob("*/*.json")
-        }
+        return {image_number(scene_id, im_id) for scene_id in self._recorded() for im_id in self._record_ids(scene_id)}
 
     def missing(self) -> list[int]:
         """Numbers of the images that the recipe asks for and that do not exist yet, ascending."""
@@ -116,11 +177,10 @@ class Dataset:
             DatasetError: a file cannot be written.
         """
         scene = self.scene(image.plan.scene_id)
-        record = {key: getattr(image, key) for key in ("camera", "gt", "gt_info", "coco", "spec")}
         try:
             for name, content in image.files.items():
                 atomic_write(scene.root / name, content)
-            write_json(self.record(image.plan.scene_id, image.plan.im_id), record)
+            write_json(self.record(image.plan.scene_id, image.plan.im_id), image.record)
         except ValueError as error:
             raise DatasetError(str(error)) from error
 
@@ -136,40 +196,55 @@ class Dataset:
     def finish(self) -> None:
         """Assemble, and describe the dataset in its card; errors as in ``assemble``."""
         with in_turn(self.root):
+            self._assembled.clear()
             if self._assemble():
                 write_card(self.root)
 
     def _assemble(self) -> int:
         """Do it, and return how many images there are."""
-        complete(self.root)
-        table = SymmetryTable.read(self.root / SYMMETRIES_FILE)
+        shutil.rmtree(self.root / DRAFT_FOLDER, ignore_errors=True)  # of a relabelling that was killed
         header = read_json(self.root / DATASET_FILE)
-        symmetries = describe_symmetries(table)
-        stale = header.get("symmetries") != symmetries
+        state = LabelState.read(self.root, header)
         infos = {int(key): info for key, info in read_json(self.root / MODELS_FOLDER / INFO_FILE).items()}
-        images = instances = 0
-        for folder in sorted((self.root / RECORDS_FOLDER).glob("*")):
-            gt = self._assemble_scene(int(folder.name), table, infos, stale)
-            images += len(gt)
-            instances += sum(len(entries) for entries in gt.values())
+        for scene_id in self._recorded():
+            changed_ns = self._records(scene_id).stat().st_mtime_ns
+            known = self._assembled.get(scene_id)
+            if known is None or known.records_changed_ns != changed_ns or not state.trusted:
+                gt = self._assemble_scene(scene_id, state, infos)
+                instances = sum(len(entries) for entries in gt.values())
+                self._assembled[scene_id] = _Assembled(changed_ns, len(gt), instances)
+        images = sum(known.images for known in self._assembled.values())
         header["recipe"] = dump_recipe(self.recipe)
-        header["counts"] = {"images": images, "instances": instances}
-        header["symmetries"] = symmetries
+        header["counts"] = {
+            "images": images,
+            "instances": sum(known.instances for known in self._assembled.values()),
+        }
+        header["symmetries"] = describe_symmetries(state.table)
         write_json(self.root / DATASET_FILE, header)
+        if is_half_labelled(self.root):
+            replace_file(self.root / PENDING_FILE, self.root / SYMMETRIES_FILE)
         return images
+
+    def _recorded(self) -> list[int]:
+        """Numbers of the scene folders that have records."""
+        folder = self.root / RECORDS_FOLDER
+        found = folder.iterdir() if folder.is_dir() else ()
+        return sorted(int(path.name) for path in found if _SIX_DIGITS.fullmatch(path.name))
+
+    def _record_ids(self, scene_id: int) -> list[int]:
+        """Ids of the images of a scene folder that have a record, ascending; files of other names are no records."""
+        found = self._records(scene_id).iterdir()
+        return sorted(int(path.stem) for path in found if path.suffix == ".json" and _SIX_DIGITS.fullmatch(path.stem))
 
     def _records(self, scene_id: int) -> Path:
         return self.root / RECORDS_FOLDER / f"{scene_id:06d}"
 
     def _assemble_scene(
-        self, scene_id: int, table: SymmetryTable, infos: Mapping[int, Entry], stale: bool
-    ) -> dict[int, Any]:
-        """Write the JSON files of a scene folder, unless they tell of every record already; return scene_gt.
-
-        ``stale`` tells that the folder's labels may be of other symmetries than the table's.
-        """
+        self, scene_id: int, state: LabelState, infos: Mapping[int, ModelInfo]
+    ) -> dict[int, list[GtEntry]]:
+        """Write the JSON files of a scene folder, unless they tell of every record already; return scene_gt."""
         scene = self.scene(scene_id)
-        paths = {int(path.stem): path for path in sorted(self._records(scene_id).glob("*.json"))}
+        paths = {im_id: self.record(scene_id, im_id) for im_id in self._record_ids(scene_id)}
         if scene.scene_camera.exists():
             listed = records.read_scene_json(scene.scene_camera).keys()
             if listed - paths.keys():
@@ -177,20 +252,20 @@ class Dataset:
                     f"{self._records(scene_id)}: lacks the records of {len(listed - paths.keys())} images; "
                     "without them the dataset cannot be continued"
                 )
-            if listed == paths.keys() and not stale:
+            if listed == paths.keys() and state.trusted:
                 return records.read_scene_json(scene.scene_gt)
-        made = {im_id: read_json(path) for im_id, path in paths.items()}
+        made = {im_id: cast(ImageRecord, read_json(path)) for im_id, path in paths.items()}
         camera = {im_id: record["camera"] for im_id, record in made.items()}
         gt = {im_id: record["gt"] for im_id, record in made.items()}
         records.write_scene_json(scene.scene_gt, gt)
         records.write_scene_json(scene.scene_gt_info, {im_id: record["gt_info"] for im_id, record in made.items()})
-        records.write_scene_json(scene.scene_gt_canonical, label_scene(gt, camera, table, infos))
+        records.write_scene_json(scene.scene_gt_canonical, label_scene(gt, camera, state.table, infos))
         write_json(scene.scene_gt_coco, self._coco(scene, made, infos))
         write_json_lines(scene.scene_spec, [made[im_id]["spec"] for im_id in sorted(made)])
         records.write_scene_json(scene.scene_camera, camera)  # last: an image listed here is in all the others
         return gt
 
-    def _coco(self, scene: ScenePaths, made: Mapping[int, Entry], infos: Mapping[int, Entry]) -> Entry:
+    def _coco(self, scene: ScenePaths, made: Mapping[int, ImageRecord], infos: Mapping[int, ModelInfo]) -> CocoFile:
         camera, extension = self.recipe.camera, self.recipe.encoding.rgb_format
         return records.scene_gt_coco(
             self.recipe.name,
@@ -214,12 +289,39 @@ class Dataset:
             SymmetryTable.from_models_info(infos, self.recipe.labels.scheme).write(self.root / SYMMETRIES_FILE)
 
 
-def describe_symmetries(table: SymmetryTable) -> Entry:
-    """What dataset.json says of the symmetries that the labels were made with."""
-    return {"scheme": table.scheme, "sha256": table.digest()}
+def _encode(
+    recipe: Recipe,
+    im_id: int,
+    annotation: ImageAnnotation,
+    rgb: NDArray[np.uint8] | None,
+    linear: NDArray[np.float32] | None,
+) -> dict[str, bytes]:
+    """The files of one image, by their paths inside the scene folder."""
+    paths, encoding = ScenePaths(Path()), recipe.encoding
+    files: dict[Path, bytes] = {}
+    wanted = set(recipe.outputs)
+    if "rgb" in wanted and rgb is not None:
+        png = encoding.rgb_format == "png"
+        content = images.encode_png(rgb) if png else images.encode_jpeg(rgb, encoding.jpeg_quality)
+        files[paths.rgb(im_id, encoding.rgb_format)] = content
+    if "exr" in wanted and linear is not None:
+        files[paths.exr(im_id)] = images.encode_exr(linear)
+    if "depth" in wanted:
+        files[paths.depth(im_id)] = images.encode_depth(annotation.depth_mm, encoding.depth_scale)
+    if "masks" in wanted:
+        for gt_id, instance in enumerate(annotation.instances):
+            files[paths.mask(im_id, gt_id)] = images.encode_mask(instance.mask)
+            files[paths.mask_visib(im_id, gt_id)] = images.encode_mask(instance.mask_visib)
+    if annotation.normals is not None:
+        files[paths.normals(im_id)] = images.encode_normals(annotation.normals)
+    if annotation.object_coordinates_mm is not None:
+        files[paths.object_coordinates(im_id)] = images.encode_object_coordinates(
+            annotation.object_coordinates_mm, annotation.instance_ids >= 0
+        )
+    return {str(path): content for path, content in files.items()}
 
 
-def _header(recipe: Recipe, models: Mapping[int, ObjectModel], scenery_digest: str) -> Entry:
+def _header(recipe: Recipe, models: Mapping[int, ObjectModel], scenery_digest: str) -> dict[str, Any]:
     """What dataset.json says before the first image."""
     return {
         "name": recipe.name,
@@ -237,7 +339,12 @@ def versions() -> dict[str, str]:
     return {name: version(name) for name in ("synthetless", "bpy")}
 
 
-def _refuse_foreign(root: Path) -> None:
+def make_folder(root: Path) -> None:
+    """Make the folder of a dataset that is to be begun.
+
+    Raises:
+        DatasetError: it cannot be made, or holds files of something else.
+    """
     try:
         root.mkdir(parents=True, exist_ok=True)
         strangers = sorted(path.name for path in root.iterdir() if not path.name.startswith("."))
@@ -249,12 +356,12 @@ def _refuse_foreign(root: Path) -> None:
         )
 
 
-def _refuse_other(path: Path, before: Entry, now: Entry) -> None:
+def _refuse_other(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Continue only what would come out the same had it never been interrupted."""
     for key in ("versions", "models_sha256", "scenery_digest"):
         if before.get(key) != now[key]:
             raise DatasetError(f"{path}: was begun with other {key} than now; use another output folder")
-    old, new = _flat(before.get("recipe", {})), _flat(now["recipe"])
+    old, new = _flat(before["recipe"]), _flat(now["recipe"])
     for key in sorted(old.keys() | new.keys()):
         if key.split(".", maxsplit=1)[0] not in _MAY_CHANGE and old.get(key) != new.get(key):
             raise DatasetError(

@@ -15,9 +15,9 @@ from typing import Any, Literal
 from pycocotools import mask as coco_mask
 from tqdm import tqdm
 
-from synthetless.dataset.changes import refuse_half_changed
+from synthetless.dataset.labels import refuse_half_labelled
 from synthetless.dataset.layout import ScenePaths, find_split, scene_ids
-from synthetless.dataset.reader import ImageLabels, read_scene
+from synthetless.dataset.reader import ImageEntries, read_entries
 from synthetless.dataset.records import Entry
 from synthetless.errors import UserError
 from synthetless.io.files import atomic_file, read_json
@@ -50,7 +50,7 @@ def export_coco(dataset: Path, to: Path, split: str | None = None, boxes: BoxKin
     Raises:
         UserError: the dataset is incomplete or contradicts itself, or the file cannot be written.
     """
-    refuse_half_changed(dataset)
+    refuse_half_labelled(dataset)
     split = split or find_split(dataset)
     licence = _licence(dataset)
     categories: dict[int, Entry] = {}
@@ -84,7 +84,7 @@ def compressed_rle(segmentation: Entry) -> Entry:
     return {"counts": rle["counts"].decode("ascii"), "size": [int(side) for side in rle["size"]]}
 
 
-def _by_image(scene: ScenePaths, coco: Entry) -> Iterator[tuple[ImageLabels, Entry, list[tuple[int, Entry]]]]:
+def _by_image(scene: ScenePaths, coco: Entry) -> Iterator[tuple[ImageEntries, Entry, list[tuple[int, Entry]]]]:
     """Each image's labels, its entry in scene_gt_coco.json, and gt_id and annotation of its visible instances.
 
     BOP's annotations do not say which instance they belong to: they are in scene_gt's order, less the hidden ones.
@@ -93,7 +93,7 @@ def _by_image(scene: ScenePaths, coco: Entry) -> Iterator[tuple[ImageLabels, Ent
     annotations: dict[int, list[Entry]] = {im_id: [] for im_id in images}
     for annotation in coco["annotations"]:
         annotations[annotation["image_id"]].append(annotation)
-    for labels in read_scene(scene):
+    for labels in read_entries(scene):
         visible = [gt_id for gt_id, info in enumerate(labels.gt_info) if info["px_count_visib"] > 0]
         found = annotations.get(labels.im_id, [])
         if labels.im_id not in images or [a["category_id"] for a in found] != [
@@ -107,7 +107,7 @@ def _by_image(scene: ScenePaths, coco: Entry) -> Iterator[tuple[ImageLabels, Ent
 
 
 def _image(
-    image: Entry, image_id: int, scene_id: int, scene: ScenePaths, labels: ImageLabels, to: Path, licensed: bool
+    image: Entry, image_id: int, scene_id: int, scene: ScenePaths, labels: ImageEntries, to: Path, licensed: bool
 ) -> Entry:
     path = os.path.relpath(scene.root / image["file_name"], to.parent)
     return {
@@ -122,11 +122,12 @@ def _image(
 
 
 def _annotations(
-    labels: ImageLabels, image: Entry, visible: Iterable[tuple[int, Entry]], boxes: BoxKind
+    labels: ImageEntries, image: Entry, visible: Iterable[tuple[int, Entry]], boxes: BoxKind
 ) -> Iterator[Entry]:
     for gt_id, annotation in visible:
-        canonical = {key: value for key, value in labels.gt_canonical[gt_id].items() if key != "obj_id"}
-        corners = canonical.pop("bbox3d_corners_2d")
+        label = labels.gt_canonical[gt_id]
+        corners = label["bbox3d_corners_2d"]
+        canonical = {key: value for key, value in label.items() if key not in ("obj_id", "bbox3d_corners_2d")}
         rle = compressed_rle(annotation["segmentation"])
         yield {
             "category_id": annotation["category_id"],

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from synthetless.dataset.changes import refuse_half_changed
+from synthetless.dataset.labels import refuse_half_labelled
 from synthetless.dataset.layout import ScenePaths, find_split, scene_ids
-from synthetless.dataset.reader import ImageLabels, read_scene
-from synthetless.dataset.records import Entry, uncompressed_rle
+from synthetless.dataset.reader import ImageEntries, read_entries
+from synthetless.dataset.records import RunLengths, uncompressed_rle
 from synthetless.errors import UserError
 from synthetless.io.files import atomic_file, atomic_folder, atomic_write, read_bytes, write_json
 from synthetless.io.images import decode_mask
@@ -78,7 +78,7 @@ def export_webdataset(
     """
     if not 1 <= images_per_shard <= MAX_IMAGES_PER_SHARD:
         raise UserError(f"images_per_shard is {images_per_shard}; 1 to {MAX_IMAGES_PER_SHARD} are possible")
-    refuse_half_changed(dataset)
+    refuse_half_labelled(dataset)
     images = list(_images(dataset, split or find_split(dataset)))
     if shuffle_seed is not None:
         order = np.random.default_rng(np.random.SeedSequence(shuffle_seed)).permutation(len(images))
@@ -113,7 +113,7 @@ def relabel_webdataset(
     paths = sorted(shards.glob("shard-*.tar"))
     if not paths:
         raise UserError(f"{shards}: holds no shards (shard-000000.tar, ...); export first")
-    refuse_half_changed(dataset)
+    refuse_half_labelled(dataset)
     images = {image.key: image for image in _images(dataset, split or find_split(dataset))}
     keys = [list(dict.fromkeys(_key(name) for name in _names(path))) for path in paths]
     key_to_shard = {key: number for number, shard in enumerate(keys) for key in shard}
@@ -130,7 +130,7 @@ def relabel_webdataset(
 def _images(dataset: Path, split: str) -> Iterator[ShardImage]:
     for scene_id in tqdm(scene_ids(dataset, split), desc="labels", unit="scene", disable=None):
         scene = ScenePaths.of(dataset, scene_id, split)
-        for labels in read_scene(scene):
+        for labels in read_entries(scene):
             key = f"{scene_id:06d}_{labels.im_id:06d}"
             yield ShardImage(key, scene, labels.im_id, len(labels.gt), _label_members(labels))
 
@@ -145,7 +145,7 @@ def _richest_first(images: list[ShardImage]) -> list[ShardImage]:
     return [images[richest], *images[:richest], *images[richest + 1 :]]
 
 
-def _label_members(labels: ImageLabels) -> Members:
+def _label_members(labels: ImageEntries) -> Members:
     return {
         "camera.json": _json(labels.camera),
         "gt.json": _json(labels.gt),
@@ -185,7 +185,7 @@ def _image_members(image: ShardImage) -> Members:
             members[f"rgb.{extension}"] = read_bytes(path)
     if (path := scene.depth(image.im_id)).parent.is_dir():
         members["depth.png"] = read_bytes(path)
-    known: dict[bytes, Entry] = {}
+    known: dict[bytes, RunLengths] = {}
     for name, mask in (("mask", scene.mask), ("mask_visib", scene.mask_visib)):
         if (scene.root / name).is_dir():
             rles = {str(gt_id): _rle(mask(image.im_id, gt_id), known) for gt_id in range(image.instances)}
@@ -193,7 +193,7 @@ def _image_members(image: ShardImage) -> Members:
     return members
 
 
-def _rle(path: Path, known: dict[bytes, Entry]) -> Entry:
+def _rle(path: Path, known: dict[bytes, RunLengths]) -> RunLengths:
     """Run lengths of a mask file; ``known`` spares decoding the two masks of an unoccluded instance twice."""
     data = read_bytes(path)
     if data not in known:

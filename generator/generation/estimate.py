@@ -9,7 +9,7 @@ from pathlib import Path
 
 from synthetless.config import Recipe
 from synthetless.dataset.layout import DATASET_FILE, IMAGES_PER_SCENE, MODELS_FOLDER, plan_image
-from synthetless.dataset.store import Dataset
+from synthetless.dataset.store import DatasetStore
 from synthetless.errors import UserError
 from synthetless.generation import devices
 from synthetless.generation.drop import DropRenderer
@@ -79,9 +79,9 @@ def estimate(recipe: Recipe, out: Path, execution: Execution) -> Estimate:
         raise UserError("--dry-run measures this machine; leave out --executor ray")
     sources = load_sources(recipe)
     check_photos(sources)
-    dataset = Dataset(out, recipe)
+    dataset = DatasetStore(out, recipe)
     if (out / DATASET_FILE).exists():
-        dataset = Dataset.open(out, recipe, sources.models, sources.scenery_digest)
+        dataset = DatasetStore.open(out, recipe, sources.models, sources.scenery_digest)
     done, missing = dataset.done(), wanted(dataset, execution.part)
     views = recipe.camera.views_per_drop
     drops = {plan_image(number, views).drop for number in missing}

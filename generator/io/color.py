@@ -41,7 +41,7 @@ def exposure_gain(linear: NDArray[np.float32], bounds: tuple[float, float]) -> f
     return float(2.0**high)
 
 
-def develop(linear: NDArray[np.float32], gain: float) -> NDArray[np.uint8]:
+def tonemap(linear: NDArray[np.float32], gain: float) -> NDArray[np.uint8]:
     """(H, W, 3) linear light, times a gain, as 8-bit sRGB."""
     displayed: NDArray[np.uint8] = np.rint(srgb(linear * np.float32(gain)) * 255).astype(np.uint8)
     return displayed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -49,6 +50,21 @@ def atomic_write(path: Path, data: bytes, durable: bool = False) -> None:
     """Write a whole file at once; arguments and errors as in ``atomic_file``."""
     with atomic_file(path, durable) as file:
         file.write(data)
+
+
+def replace_file(source: Path, target: Path) -> None:
+    """Move a whole file to where another one may be, on another disk, too; at every moment one of them is there.
+
+    Raises:
+        UserError: it cannot be written there.
+    """
+    try:
+        source.replace(target)
+    except OSError as error:
+        if error.errno != errno.EXDEV:
+            raise UserError(f"{target}: cannot be written ({error.strerror})") from error
+        atomic_write(target, read_bytes(source), durable=True)
+        source.unlink()
 
 
 @contextmanager
@@ -232,12 +248,20 @@ def _flock(path: Path, mode: int, busy: str) -> Iterator[None]:
         try:
             fcntl.flock(lock, mode)
             taken_away = not os.path.samestat(path.stat(), os.fstat(lock.fileno()))
-        except OSError:
+        except BlockingIOError:
             raise LockedError(busy) from None
+        except FileNotFoundError:
+            taken_away = True
+        except OSError as error:
+            raise UserError(
+                f"{path}: this file system cannot lock files ({error.strerror}); "
+                "give a folder on another one, or mount it with locks (Lustre: -o flock)"
+            ) from None
         if taken_away:
             raise LockedError(busy)
         try:
             yield
         finally:
             if mode & fcntl.LOCK_EX:
-                path.unlink(missing_ok=True)
+                with suppress(OSError):  # the folder may have become read-only; the file alone locks nobody out
+                    path.unlink()

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from synthetless.dataset.labels import box_corners_mm
 from synthetless.dataset.layout import ScenePaths
-from synthetless.dataset.reader import ImageLabels
-from synthetless.dataset.records import Entry
-from synthetless.generation.rerender import RecordedImage
+from synthetless.dataset.reader import ImageEntries
+from synthetless.dataset.records import Entry, GtInfoEntry, ImageSpec
 from synthetless.io.files import atomic_write
 from synthetless.preview import overlays, parameters, pictures
 
@@ -36,8 +35,8 @@ class ImageTask:
     """
 
     scene: ScenePaths
-    labels: ImageLabels
-    recorded: RecordedImage | None
+    labels: ImageEntries
+    recorded: ImageSpec | None
     infos: Mapping[int, Entry]
     size_px: tuple[int, int]
     to: Path
@@ -114,7 +113,7 @@ def _pose(K: NDArray[np.float64], rotation: list[float], translation: list[float
     }
 
 
-def _place(info: Entry) -> list[float]:
+def _place(info: GtInfoEntry) -> list[float]:
     """Where an instance's words are written: the middle of its visible box; nowhere if it is hidden."""
     x, y, w, h = info["bbox_visib"]
     return [] if w < 0 else [x + w / 2, y + h / 2]

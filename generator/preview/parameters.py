@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from synthetless.dataset.records import Entry
-from synthetless.generation.rerender import RecordedImage
+from synthetless.dataset.records import CameraEntry, ImageSpec
 from synthetless.io.color import srgb
 from synthetless.scenes.spec import Material, PlaneSpec, Vector, View
 from synthetless.scenes.textures import PhotoTexture
@@ -15,7 +14,7 @@ from synthetless.scenes.textures import PhotoTexture
 Section = dict[str, Any]
 
 
-def sections(camera: Entry, recorded: RecordedImage | None) -> list[Section]:
+def sections(camera: CameraEntry, recorded: ImageSpec | None) -> list[Section]:
     """Sections of an image: {"title", "rows"}, a row being [name, value] or [name, value, CSS colour]."""
     fx, _, cx, _, fy, cy = (float(value) for value in camera["cam_K"][:6])
     pinhole = [["focal lengths", f"{fx:.2f}, {fy:.2f} px"], ["principal point", f"{cx:.2f}, {cy:.2f} px"]]
@@ -50,7 +49,7 @@ def sections(camera: Entry, recorded: RecordedImage | None) -> list[Section]:
     ]
 
 
-def material(recorded: RecordedImage | None, gt_id: int) -> list[str]:
+def material(recorded: ImageSpec | None, gt_id: int) -> list[str]:
     """[words, CSS colour] of a labelled instance's material; nothing if it was not recorded."""
     if recorded is None:
         return []

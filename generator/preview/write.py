@@ -13,10 +13,9 @@ from tqdm import tqdm
 
 from synthetless.dataset import records
 from synthetless.dataset.layout import CAMERA_FILE, DATASET_FILE, ScenePaths, find_split, scene_ids
-from synthetless.dataset.reader import ImageLabels, read_scene
+from synthetless.dataset.reader import ImageEntries, read_entries, read_specs
 from synthetless.dataset.records import Entry
 from synthetless.errors import UserError
-from synthetless.generation.rerender import read_recorded
 from synthetless.io.files import atomic_folder, atomic_write, read_json
 from synthetless.io.models import INFO_FILE, read_models_info
 from synthetless.io.parallel import processes
@@ -119,8 +118,8 @@ class _Source:
                 yield list(self._scene(ScenePaths.of(self.dataset, scene_id, self.split), numbers, to))
 
     def _scene(self, scene: ScenePaths, numbers: set[int], to: Path) -> Iterator[ImageTask]:
-        recorded = read_recorded(scene) if scene.scene_spec.exists() else {}
-        for number, labels in enumerate(read_scene(scene)):
+        recorded = read_specs(scene) if scene.scene_spec.exists() else {}
+        for number, labels in enumerate(read_entries(scene)):
             if number in numbers:
                 self._check_objects(scene, labels)
                 yield ImageTask(scene, labels, recorded.get(labels.im_id), self.infos, self._size_px(), to)
@@ -133,7 +132,7 @@ class _Source:
         except (KeyError, TypeError, ValueError):
             raise UserError(f"{path}: needs the images' width and height") from None
 
-    def _check_objects(self, scene: ScenePaths, labels: ImageLabels) -> None:
+    def _check_objects(self, scene: ScenePaths, labels: ImageEntries) -> None:
         for entry in labels.gt:
             if entry.get("obj_id") not in self.infos:
                 raise UserError(

@@ -9,10 +9,9 @@ from pathlib import Path
 import cv2
 from pydantic import TypeAdapter
 
-from synthetless.dataset.adopt import models_folder
-from synthetless.dataset.changes import is_half_changed
-from synthetless.dataset.labelling import scene_folders
-from synthetless.dataset.layout import DATASET_FILE, SYMMETRIES_FILE, ScenePaths
+from synthetless.dataset.labels import is_half_labelled
+from synthetless.dataset.layout import DATASET_FILE, SYMMETRIES_FILE, ScenePaths, scene_folders
+from synthetless.dataset.layout import find_models_folder as models_folder
 from synthetless.dataset.records import Entry
 from synthetless.io.images import decode_depth
 from synthetless.io.models import INFO_FILE
@@ -72,7 +71,7 @@ def is_adopted(root: Path) -> bool:
 def read_adopted(root: Path, limit: int) -> tuple[Adopted, list[Finding]]:
     """Read and check what lies outside the scene folders."""
     findings: list[Finding] = []
-    if is_half_changed(root):
+    if is_half_labelled(root):
         message = "the dataset is half labelled: adopt was killed while the files took their places; run it again"
         findings.append(Finding("stale", root / SYMMETRIES_FILE, message))
     infos: Mapping[int, Entry] | None = None

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 
@@ -82,8 +83,8 @@ def _recomputed(
     gt: dict[int, list[Entry]] = {}
     for im_id, gt_id in places:
         gt.setdefault(im_id, []).append(labels.gt[im_id][gt_id])
-    labelled = label_scene(gt, labels.camera, table, infos)
-    return [entry for im_id in gt for entry in labelled[im_id]]
+    labelled = label_scene(cast(Any, gt), cast(Any, labels.camera), table, infos)
+    return [cast(Entry, entry) for im_id in gt for entry in labelled[im_id]]
 
 
 def _rows(entries: list[Entry]) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synthetless.annotation.instances import ImageAnnotation, InstanceAnnotation, PosedModel
-from synthetless.annotation.raycast import Occluder, Plane, RayCaster
+from synthetless.annotation.raycast import Plane, RayCaster
 from synthetless.dataset.layout import MODELS_FOLDER
 from synthetless.generation.sources import models_folder
 from synthetless.io.images import decode_depth, decode_mask, has_depth
@@ -96,7 +96,7 @@ def _meshes(source: Source) -> Meshes:
 
 
 def _key(role: Role, obj_id: int) -> Any:
-    return obj_id if role == "model" else (role, obj_id)
+    return (role, obj_id)
 
 
 def _can_be_cast(labels: SceneLabels, im_id: int, meshes: Meshes) -> bool:
@@ -116,7 +116,7 @@ def _cast(source: Source, labels: SceneLabels, im_id: int, caster: RayCaster) ->
         for entry in labels.gt[im_id]
     ]
     unlabelled = [
-        Occluder(_key(item.role, item.obj_id), *model_to_camera(pose, R_w2c, t_w2c))
+        PosedModel(item.obj_id, *model_to_camera(pose, R_w2c, t_w2c), item.role)
         for number, (item, pose) in enumerate(zip(recorded.scene.objects, recorded.settled, strict=True))
         if number not in recorded.instances
     ]

@@ -10,8 +10,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from synthetless.dataset.layout import ImagePlan, ScenePaths
-from synthetless.dataset.records import Entry, read_scene_json
-from synthetless.generation.rerender import RecordedImage
+from synthetless.dataset.records import Entry, ImageSpec, read_scene_json
 from synthetless.io.files import read_json, read_json_lines
 from synthetless.validation.report import Finding, unusable
 from synthetless.validation.schemas import (
@@ -30,7 +29,7 @@ _GT = TypeAdapter(list[GtEntry])
 _GT_INFO = TypeAdapter(list[GtInfoEntry])
 CANONICAL = TypeAdapter(list[CanonicalEntry])
 _COCO, _COCO_IMAGE, _COCO_ANNOTATION = TypeAdapter(CocoFile), TypeAdapter(CocoImage), TypeAdapter(CocoAnnotation)
-_SPEC = TypeAdapter(RecordedImage)
+_SPEC = TypeAdapter(ImageSpec)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +51,7 @@ class SceneLabels:
     gt_info: dict[int, list[Entry]] = field(default_factory=dict)
     canonical: dict[int, list[Entry]] = field(default_factory=dict)
     coco: Entry | None = None
-    spec: dict[int, RecordedImage] = field(default_factory=dict)
+    spec: dict[int, ImageSpec] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
 
     @classmethod
@@ -168,13 +167,13 @@ def _good_items(
     return good
 
 
-def _read_spec(path: Path, findings: list[Finding]) -> dict[int, RecordedImage]:
+def _read_spec(path: Path, findings: list[Finding]) -> dict[int, ImageSpec]:
     try:
         lines = read_json_lines(path)
     except ValueError as error:
         findings.append(unusable(path, error))
         return {}
-    recorded: dict[int, RecordedImage] = {}
+    recorded: dict[int, ImageSpec] = {}
     for number, line in enumerate(lines, start=1):
         im_id = line.get("image_id") if isinstance(line, dict) else None
         place = im_id if isinstance(im_id, int) else None

@@ -8,10 +8,8 @@ import numpy as np
 
 from synthetless.annotation.instances import image_window
 from synthetless.dataset.layout import ImagePlan
-from synthetless.dataset.records import Entry, camera_matrix
-from synthetless.generation.rerender import RecordedImage
-from synthetless.scenes.camera import extrinsics
-from synthetless.scenes.render import centre
+from synthetless.dataset.records import Entry, ImageSpec, camera_matrix
+from synthetless.scenes.camera import extrinsics, settled_centre
 from synthetless.validation.geometry import (
     ROTATION_TOLERANCE,
     Array,
@@ -99,7 +97,7 @@ def check_specs(
                 yield from _check_unlabelled(source, labels, recorded)
 
 
-def _check_plan(labels: SceneLabels, recorded: RecordedImage, plan: ImagePlan) -> Iterator[Finding]:
+def _check_plan(labels: SceneLabels, recorded: ImageSpec, plan: ImagePlan) -> Iterator[Finding]:
     found, expected = (recorded.scene.drop, recorded.view), (plan.drop, plan.view)
     if found != expected:
         yield Finding(
@@ -110,7 +108,7 @@ def _check_plan(labels: SceneLabels, recorded: RecordedImage, plan: ImagePlan) -
         )
 
 
-def incoherence(recorded: RecordedImage, n_labelled: int) -> str | None:
+def incoherence(recorded: ImageSpec, n_labelled: int) -> str | None:
     """Why a record contradicts itself or the number of labels, if it does."""
     objects, settled, shown = recorded.scene.objects, recorded.settled, recorded.instances
     if len(settled) != len(objects):
@@ -126,9 +124,9 @@ def incoherence(recorded: RecordedImage, n_labelled: int) -> str | None:
     return None
 
 
-def _check_camera_pose(labels: SceneLabels, recorded: RecordedImage) -> Iterator[Finding]:
+def _check_camera_pose(labels: SceneLabels, recorded: ImageSpec) -> Iterator[Finding]:
     camera = labels.camera[recorded.image_id]
-    R, t_m = extrinsics(recorded.scene.views[recorded.view], centre(recorded.settled))
+    R, t_m = extrinsics(recorded.scene.views[recorded.view], settled_centre(recorded.settled))
     off = _difference(camera["cam_R_w2c"], camera["cam_t_w2c"], R, 1000 * t_m)
     if off:
         yield Finding(
@@ -136,7 +134,7 @@ def _check_camera_pose(labels: SceneLabels, recorded: RecordedImage) -> Iterator
         )
 
 
-def _check_settled(labels: SceneLabels, recorded: RecordedImage, sound: set[Place]) -> Iterator[Finding]:
+def _check_settled(labels: SceneLabels, recorded: ImageSpec, sound: set[Place]) -> Iterator[Finding]:
     im_id = recorded.image_id
     R_w2c, t_w2c = _world_to_camera(labels, im_id)
     for gt_id, (entry, number) in enumerate(zip(labels.gt[im_id], recorded.instances, strict=True)):
@@ -157,7 +155,7 @@ def _check_settled(labels: SceneLabels, recorded: RecordedImage, sound: set[Plac
                 yield Finding("pose", labels.paths.scene_gt, message, im_id, gt_id)
 
 
-def _check_unlabelled(source: Source, labels: SceneLabels, recorded: RecordedImage) -> Iterator[Finding]:
+def _check_unlabelled(source: Source, labels: SceneLabels, recorded: ImageSpec) -> Iterator[Finding]:
     """A model that is wholly inside the image must have a label, even if it is hidden."""
     im_id, camera = recorded.image_id, source.recipe.intrinsics
     R_w2c, t_w2c = _world_to_camera(labels, im_id)

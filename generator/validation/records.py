@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from synthetless.dataset.layout import RECORDS_FOLDER
-from synthetless.dataset.store import Dataset
+from synthetless.dataset.store import DatasetStore
 from synthetless.io.files import read_json
 from synthetless.validation.labels import SceneLabels
 from synthetless.validation.report import Finding, unusable
@@ -20,7 +20,7 @@ def check_records(source: Source, scene_id: int, labels: SceneLabels) -> Iterato
     """
     if not (source.root / RECORDS_FOLDER).is_dir():
         return
-    dataset = Dataset(source.root, source.recipe)
+    dataset = DatasetStore(source.root, source.recipe)
     files = (
         ("camera", labels.paths.scene_camera, labels.camera),
         ("gt", labels.paths.scene_gt, labels.gt),

@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from synthetless.config import Recipe
 from synthetless.dataset import records
-from synthetless.dataset.changes import is_half_changed
+from synthetless.dataset.labels import is_half_labelled
 from synthetless.dataset.layout import (
     CAMERA_FILE,
     DATASET_FILE,
@@ -100,7 +100,7 @@ def plans_by_scene(recipe: Recipe) -> dict[int, list[ImagePlan]]:
 
 def check_folders(root: Path, recipe: Recipe, scenes: Sequence[int]) -> Iterator[Finding]:
     """Scene folders that are missing or foreign, leftovers of interrupted writing, and the marker of a relabelling."""
-    if is_half_changed(root):
+    if is_half_labelled(root):
         message = "the dataset is half relabelled: relabel was killed while the files took their places; run it again"
         yield Finding("stale", root / SYMMETRIES_FILE, message)
     for path in sorted(root.glob(".*.part")):
@@ -136,7 +136,7 @@ def _check_camera_file(path: Path, recipe: Recipe) -> Iterator[Finding]:
     bad = [Finding("schema", path, fault.message) for fault in faults(TypeAdapter(CameraFile), content)]
     yield from bad
     if not bad:
-        expected: dict[str, Any] = records.camera_json(recipe.intrinsics, recipe.encoding.depth_scale)
+        expected: Mapping[str, Any] = records.camera_json(recipe.intrinsics, recipe.encoding.depth_scale)
         for key, value in expected.items():
             if content[key] != value:
                 yield Finding("camera", path, f"{key} is {content[key]}; the recipe has {value}")

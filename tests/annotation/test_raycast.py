@@ -19,7 +19,7 @@ from scipy.ndimage import binary_erosion, binary_fill_holes
 from scipy.spatial.transform import Rotation
 
 from synthetless.annotation.instances import BACKGROUND, ImageAnnotation, PosedModel, image_window
-from synthetless.annotation.raycast import Occluder, Plane, PosedSurface, RayCaster, Rays, Surface
+from synthetless.annotation.raycast import Plane, PosedSurface, RayCaster, Rays, Surface
 from synthetless.scenes.spec import Intrinsics
 
 CAMERA = Intrinsics(width=160, height=120, fx=240.0, fy=236.0, cx=81.3, cy=58.6)
@@ -50,14 +50,17 @@ def caster() -> RayCaster:
     sphere, cylinder, box = trimesh.creation.icosphere, trimesh.creation.cylinder, trimesh.creation.box
     return RayCaster(
         {
-            "sphere": arrays(sphere(subdivisions=6, radius=RADIUS)),
-            "cylinder": arrays(cylinder(radius=RADIUS, height=HEIGHT, sections=1024)),
-            "box": arrays(box(BOX)),
-            "far box": arrays(box(BOX), SHIFT),
-            "coarse": arrays(sphere(subdivisions=3, radius=RADIUS)),
-            "torus": arrays(trimesh.creation.torus(35.0, 12.0, major_sections=24, minor_sections=12)),
-            "square": square(40.0),
-            "wall": square(4000.0),
+            ("model", name): mesh
+            for name, mesh in {
+                "sphere": arrays(sphere(subdivisions=6, radius=RADIUS)),
+                "cylinder": arrays(cylinder(radius=RADIUS, height=HEIGHT, sections=1024)),
+                "box": arrays(box(BOX)),
+                "far box": arrays(box(BOX), SHIFT),
+                "coarse": arrays(sphere(subdivisions=3, radius=RADIUS)),
+                "torus": arrays(trimesh.creation.torus(35.0, 12.0, major_sections=24, minor_sections=12)),
+                "square": square(40.0),
+                "wall": square(4000.0),
+            }.items()
         }
     )
 
@@ -233,7 +236,7 @@ def test_horizon() -> None:
 def test_pixel_centres_are_at_whole_numbers() -> None:
     """A square of 0.2 px around (u, v) = (i, j) is seen in that pixel alone; one between the centres is not."""
     camera, z = Intrinsics(64, 48, 100.0, 100.0, 31.5, 23.5), 500.0
-    tiny = RayCaster({1: square(0.2 * z / camera.fx)})
+    tiny = RayCaster({("model", 1): square(0.2 * z / camera.fx)})
 
     def seen(u: float, v: float) -> list[list[int]]:
         t = np.array([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
@@ -251,7 +254,7 @@ def test_box_is_the_span_of_the_pixels() -> None:
     """Columns 20.5 .. 30.5 are ten pixels, 21 to 30: w is 9, as bop_toolkit counts."""
     camera, z = Intrinsics(64, 48, 100.0, 100.0, 0.0, 0.0), 100.0
     instance = (
-        RayCaster({1: square(10.0)})
+        RayCaster({("model", 1): square(10.0)})
         .annotate(camera, None, [PosedModel(1, UPRIGHT, np.array([25.5, 15.5, z]))])
         .instances[0]
     )
@@ -287,7 +290,7 @@ def test_the_nearer_hides_the_farther_in_any_order() -> None:
 
 def test_occluders_hide_but_have_no_label() -> None:
     hidden = ("square", UPRIGHT, [0, 0, 400.0])
-    half = Occluder("wall", UPRIGHT, np.array([2000.0, 0, 300.0]))  # covers u > cx
+    half = PosedModel("wall", UPRIGHT, np.array([2000.0, 0, 300.0]))  # covers u > cx
     result = annotate(hidden, occluders=[half], normals=True, object_coordinates=True)
     (instance,) = result.instances
     right = np.arange(CAMERA.width)[None] > CAMERA.cx
@@ -359,7 +362,7 @@ def test_counts_beyond_the_border_are_those_on_a_threefold_canvas(
 def test_truncated_at_the_border() -> None:
     camera, z = Intrinsics(64, 48, 100.0, 100.0, 0.0, 0.0), 100.0
     instance = (
-        RayCaster({1: square(10.0)})
+        RayCaster({("model", 1): square(10.0)})
         .annotate(camera, None, [PosedModel(1, UPRIGHT, np.array([-0.5, 20.5, z]))])
         .instances[0]
     )
@@ -407,7 +410,9 @@ def test_no_ray_slips_between_triangles_at_their_vertices() -> None:
     vertices = np.stack([x.ravel(), y.ravel(), np.zeros(n * n)], axis=1).astype(float)
     a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
     faces = np.concatenate([np.stack([a, a + 1, a + n + 1], 1), np.stack([a, a + n + 1, a + n], 1)])
-    result = RayCaster({1: (vertices, faces)}).annotate(camera, None, [PosedModel(1, UPRIGHT, np.array([0, 0, 64.0]))])
+    result = RayCaster({("model", 1): (vertices, faces)}).annotate(
+        camera, None, [PosedModel(1, UPRIGHT, np.array([0, 0, 64.0]))]
+    )
     assert result.instances[0].mask.all()
     assert (result.depth_mm == 64.0).all()
 
@@ -436,7 +441,7 @@ def test_degenerate_triangles_are_ignored() -> None:
     on_a_line = np.array([[-20, 0.1, 0], [0.3, 0.1, 0], [20, 0.1, 0], [0, 0, 0], [0, 0, 0]])
     vertices = np.concatenate([vertices, on_a_line])
     faces = np.concatenate([[[4, 5, 6], [7, 7, 7], [7, 8, 4], [0, 0, 1]], faces])
-    spoilt = RayCaster({1: (vertices, faces)}).annotate(
+    spoilt = RayCaster({("model", 1): (vertices, faces)}).annotate(
         CAMERA, None, [PosedModel(1, UPRIGHT, np.array([0, 0, 400.0]))], normals=True
     )
     clean = annotate(("square", UPRIGHT, [0, 0, 400.0]), normals=True)
@@ -482,7 +487,7 @@ def test_measurements_agree_with_each_other(
 ) -> None:
     result = annotate(
         *scene,
-        occluders=[Occluder(*posed) for posed in occluders],
+        occluders=[PosedModel(*posed) for posed in occluders],
         visibility_delta_mm=delta_mm,
         plane=Plane(np.diag([1.0, -1, -1]), np.array([0, 0, 500.0])) if table else None,
     )
@@ -533,12 +538,12 @@ def test_a_repetition_gives_the_same_bytes(scene: list[tuple[str, Array, Array]]
 )
 def test_unusable_meshes_are_refused(mesh: MeshArrays, message: str) -> None:
     with pytest.raises(ValueError, match=message) as refusal:
-        RayCaster({7: mesh}).annotate(CAMERA, None, [PosedModel(7, UPRIGHT, np.array([0, 0, 400.0]))])
+        RayCaster({("model", 7): mesh}).annotate(CAMERA, None, [PosedModel(7, UPRIGHT, np.array([0, 0, 400.0]))])
     assert str(refusal.value).startswith("object 7: ") and "\n" not in str(refusal.value)
 
 
 def test_unknown_objects_and_negative_tolerances_are_refused() -> None:
-    with pytest.raises(ValueError, match="no mesh for object 'cube'; there are 'sphere', "):
+    with pytest.raises(ValueError, match="no mesh for object cube; there are object sphere, "):
         annotate(("cube", UPRIGHT, [0, 0, 400.0]))
     with pytest.raises(ValueError, match=r"visibility_delta_mm is -1\.0; a number >= 0 is needed"):
         annotate(visibility_delta_mm=-1.0)
@@ -559,7 +564,7 @@ def test_real_models_agree_with_one_merged_scene(tless_models: Path, seed: int) 
         PosedModel(int(i), random_rotation(int(rng.integers(10**6))), rng.uniform([-150, -100, 650], [150, 100, 900]))
         for i in obj_ids
     ]
-    result = RayCaster({i: arrays(mesh) for i, mesh in loaded.items()}).annotate(camera, None, posed)
+    result = RayCaster({("model", i): arrays(mesh) for i, mesh in loaded.items()}).annotate(camera, None, posed)
 
     vertices = [loaded[p.obj_id].vertices @ p.R_m2c.T + p.t_m2c for p in posed]
     starts = np.cumsum([0] + [len(v) for v in vertices])

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from synthetless.annotation.instances import ImageAnnotation, PosedModel
 from synthetless.annotation.raycast import RayCaster
+from synthetless.annotation.scene import scene_caster
 from synthetless.io.models import ObjectModel, load_models
 from synthetless.scenes.spec import Intrinsics
 from synthetless.symmetry import SymmetryTable
@@ -21,7 +22,7 @@ POSES = 4
 def _compare(models: dict[int, ObjectModel], scheme: str) -> list[tuple[int, str, float, float]]:
     """For each object: id, group, worst IoU of silhouettes, worst median depth difference in mm."""
     table = SymmetryTable.from_models_info({key: model.info for key, model in models.items()}, scheme)  # type: ignore[arg-type]
-    caster = RayCaster({key: (model.vertices_mm, model.faces) for key, model in models.items()})
+    caster = scene_caster({"model": models})
     results = []
     for obj_id in models:
         R = Rotation.random(POSES, random_state=obj_id).as_matrix()

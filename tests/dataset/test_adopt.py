@@ -14,10 +14,10 @@ from numpy.testing import assert_allclose
 from posed import random_camera, random_poses
 from trees import contents
 
-from synthetless.dataset.adopt import adopt
 from synthetless.dataset.labels import label_scene
 from synthetless.dataset.layout import ScenePaths
 from synthetless.dataset.records import read_scene_json, write_scene_json
+from synthetless.dataset.relabel import adopt
 from synthetless.io.models import read_models_info
 from synthetless.symmetry import SymmetryTable
 

@@ -19,7 +19,7 @@ from synthetless.config import load_recipe
 from synthetless.dataset.card import escape, write_card
 from synthetless.dataset.layout import CARD_FILE, ScenePaths
 from synthetless.dataset.records import read_scene_json
-from synthetless.dataset.store import Dataset
+from synthetless.dataset.store import DatasetStore
 from synthetless.exports.webdataset import export_webdataset
 from synthetless.io.models import load_models
 
@@ -158,7 +158,7 @@ def test_escaped_text_is_one_line_without_active_characters(text: str) -> None:
 
 def test_an_empty_dataset_has_a_card(tmp_path: Path, parts: Path) -> None:
     recipe = load_recipe(None, valid_dataset.RECIPE)
-    Dataset.open(tmp_path / "d", recipe, load_models(parts), "").assemble()
+    DatasetStore.open(tmp_path / "d", recipe, load_models(parts), "").assemble()
     _, body = _card(tmp_path / "d")
     assert "0 synthetic images with 0 instances of 0 objects (0.0 an image)" in body
 

@@ -57,9 +57,18 @@ def test_every_instance_gets_the_label_it_would_get_alone(seed: int, counts: lis
 def test_only_some_objects_are_labelled_on_request() -> None:
     gt, camera = _scene(0, [8, 8])
     whole = label_scene(gt, camera, TABLE, INFOS)
-    some = label_scene(gt, camera, TABLE, INFOS, only={26})
+    stored = label_scene(gt, camera, SymmetryTable(TABLE.entries, "atlas"), INFOS)
+    some = label_scene(gt, camera, TABLE, INFOS, {26}, stored)
     for im_id, entries in whole.items():
-        assert some[im_id] == [entry if entry["obj_id"] == 26 else {} for entry in entries]
+        mixed = zip(entries, stored[im_id], strict=True)
+        assert some[im_id] == [entry if entry["obj_id"] == 26 else before for entry, before in mixed]
+    assert some not in (whole, stored)
+
+
+def test_labels_that_nobody_has_cannot_be_kept() -> None:
+    gt, camera = _scene(0, [8, 8])
+    with pytest.raises(ValueError, match="no stored labels"):
+        label_scene(gt, camera, TABLE, INFOS, only={26})
 
 
 def _damage(gt: dict[int, Any], camera: dict[int, Any], infos: dict[int, Any], kind: str) -> None:

@@ -21,10 +21,10 @@ from hypothesis import strategies as st
 from posed import commit, open_dataset
 from trees import contents
 
-from synthetless.dataset.changes import is_half_changed
+from synthetless.dataset.labels import is_half_labelled
 from synthetless.dataset.records import read_scene_json
 from synthetless.dataset.relabel import relabel
-from synthetless.dataset.store import Dataset
+from synthetless.dataset.store import DatasetStore
 from synthetless.io.files import LockedError, locked, read_json
 from synthetless.io.models import ObjectModel, load_models
 from synthetless.symmetry import SymmetryTable
@@ -291,6 +291,13 @@ def test_a_missing_file_is_named(root: Path, name: str) -> None:
     )
 
 
+def test_a_damaged_recipe_is_told_before_anything_is_written(root: Path) -> None:
+    header = read_json(root / "dataset.json")
+    header["recipe"]["camera"]["width"] = "wide"
+    (root / "dataset.json").write_text(json.dumps(header))
+    _assert_refused(root, lambda: relabel(root, scheme="atlas", workers=1), r"dataset\.json: its recipe is damaged")
+
+
 def test_a_pose_that_is_none_is_named(root: Path) -> None:
     path = root / SPLIT / "000002" / "scene_gt.json"
     gt = read_json(path)
@@ -318,7 +325,7 @@ def test_a_full_disk_leaves_the_dataset_alone(root: Path, monkeypatch: pytest.Mo
         with Path("/dev/full").open("wb", buffering=0) as file:
             file.write(data)
 
-    monkeypatch.setattr("synthetless.dataset.labelling.atomic_write", write)
+    monkeypatch.setattr("synthetless.dataset.relabel.atomic_write", write)
     _assert_refused(
         root, lambda: relabel(root, scheme="atlas", workers=1), "cannot be written .No space left on device."
     )
@@ -330,7 +337,7 @@ def _assert_refused(root: Path, call: Callable[[], object], message: str) -> Non
         call()
     assert "\n" not in str(error.value)
     assert contents(root) == before
-    assert not [path for path in root.rglob("*") if "relabel" in path.name]
+    assert not [path for path in root.rglob("*") if "relabel" in path.name or path.name == ".symmetries.json"]
 
 
 # What must survive a kill
@@ -353,12 +360,14 @@ def _in_child(work: Callable[[], object]) -> multiprocessing.process.BaseProcess
 def _judge(root: Path, before: dict[str, bytes], after: dict[str, bytes]) -> str:
     """Every file is whole and either old or new; together they are old or new, unless they are known to be mixed."""
     found = {
-        name: data for name, data in contents(root).items() if not name.startswith(".relabel") and ".lock" not in name
+        name: data
+        for name, data in contents(root).items()
+        if not name.startswith((".relabel", ".symmetries.json")) and ".lock" not in name
     }
     assert found.keys() == before.keys()
     for name, data in found.items():
         assert data in (before[name], after[name])
-    if is_half_changed(root):
+    if is_half_labelled(root):
         return "half"
     assert found in (before, after)
     return "old" if found == before else "new"
@@ -395,7 +404,7 @@ def test_a_kill_before_any_change_on_disk_loses_nothing(
         child.join()
         seen.append(_judge(root, before, after))
         other = Path(shutil.copytree(root, tmp_path / f"{step}o"))
-        Dataset.assemble(open_dataset(other, models))
+        DatasetStore.assemble(open_dataset(other, models))
         continued = {name: data for name, data in contents(other).items() if ".lock" not in name}
         assert continued == (before if seen[-1] == "old" else after)
         if seen[-1] == "half":
@@ -434,14 +443,14 @@ def test_workers_of_a_killed_relabelling_do_no_harm(original: Path, relabelled: 
     script = tmp_path / "script.py"
     script.write_text(f"""
 from pathlib import Path
-import synthetless.dataset.labelling
+import synthetless.dataset.relabel
 from synthetless.dataset.relabel import relabel
 
 if __name__ == "__main__":
-    synthetless.dataset.labelling.atomic_write = lambda *given: (print("a scene is labelled", flush=True), input())
+    synthetless.dataset.relabel.atomic_write = lambda *given, **how: (print("a scene is labelled", flush=True), input())
     relabel(Path({str(root)!r}), scheme="atlas", workers=2)
 """)
-    environment, pipe = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}, subprocess.PIPE
+    environment, pipe = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2] / "src")}, subprocess.PIPE
     process = subprocess.Popen([sys.executable, script], stdin=pipe, stdout=pipe, env=environment)
     assert process.stdout is not None
     assert process.stdout.readline() == b"a scene is labelled\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import socket
 from pathlib import Path
 
@@ -14,7 +15,8 @@ from trees import contents
 from synthetless.config import Recipe, load_recipe
 from synthetless.dataset import records
 from synthetless.dataset.layout import Part, by_drop, image_number, plan_image
-from synthetless.dataset.store import Dataset, DatasetError, FinishedImage
+from synthetless.dataset.store import DatasetError, DatasetStore, FinishedImage
+from synthetless.errors import UserError
 from synthetless.io import images
 from synthetless.io.files import LockedError, in_turn, locked, read_json
 from synthetless.io.models import ObjectModel, load_models
@@ -51,25 +53,27 @@ def _image(number: int) -> FinishedImage:
     return FinishedImage(
         plan,
         {f"rgb/{plan.im_id:06d}.png": images.encode_png(pixels)},
-        records.camera_entry(np.diag([50.0, 50.0, 1.0]), np.eye(3), np.array([0.0, 0.0, 600.0]), 0.1),
-        [records.gt_entry(1, rotation, np.array([0.0, 0.0, 600.0]))],
-        [{**info, "visib_fract": 1.0}],
-        [],
-        {"image_id": plan.im_id, "drop": plan.drop},
+        {
+            "camera": records.camera_entry(np.diag([50.0, 50.0, 1.0]), np.eye(3), np.array([0.0, 0.0, 600.0]), 0.1),
+            "gt": [records.gt_entry(1, rotation, np.array([0.0, 0.0, 600.0]))],
+            "gt_info": [{**info, "visib_fract": 1.0}],
+            "coco": [],
+            "spec": {"image_id": plan.im_id, "drop": plan.drop},
+        },
     )
 
 
 def test_an_interrupted_dataset_ends_like_an_uninterrupted_one(
     tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel]
 ) -> None:
-    whole = Dataset.open(tmp_path / "whole", recipe, models, "")
+    whole = DatasetStore.open(tmp_path / "whole", recipe, models, "")
     for number in range(4):
         whole.commit(_image(number))
     whole.assemble()
 
     root = tmp_path / "pieces"
     for order in ([2], [0, 3], [1]):
-        pieces = Dataset.open(root, recipe, models, "")
+        pieces = DatasetStore.open(root, recipe, models, "")
         for number in order:
             assert number in pieces.missing()
             pieces.commit(_image(number))
@@ -79,7 +83,7 @@ def test_an_interrupted_dataset_ends_like_an_uninterrupted_one(
 
 
 def test_assembling_twice_changes_nothing(tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel]) -> None:
-    dataset = Dataset.open(tmp_path / "d", recipe, models, "")
+    dataset = DatasetStore.open(tmp_path / "d", recipe, models, "")
     dataset.commit(_image(0))
     dataset.assemble()
     before = contents(tmp_path / "d")
@@ -92,21 +96,54 @@ def test_an_interrupted_assembly_is_made_good(
     tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel], lost: str
 ) -> None:
     """Assembly writes scene_camera.json last: whatever was cut off before is written again."""
-    dataset = Dataset.open(tmp_path / "d", recipe, models, "")
+    dataset = DatasetStore.open(tmp_path / "d", recipe, models, "")
     dataset.commit(_image(0))
     dataset.assemble()
     complete = contents(tmp_path / "d")
     scene = dataset.scene(1)
     (scene.root / lost).unlink()
     scene.scene_camera.unlink(missing_ok=True)
-    dataset.assemble()
+    DatasetStore(tmp_path / "d", recipe).assemble()
     assert contents(tmp_path / "d") == complete
+
+
+def test_assembling_does_not_read_again_what_is_finished(
+    tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = recipe.model_copy(update={"images": 3000})
+    dataset = DatasetStore.open(tmp_path / "d", recipe, models, "")
+    for number in (0, 1000, 2000):
+        dataset.commit(_image(number))
+    dataset.assemble()
+    read: list[Path] = []
+    monkeypatch.setattr("synthetless.dataset.store.read_json", lambda path: read.append(path) or read_json(path))
+    dataset.commit(_image(2001))
+    dataset.assemble()
+    assert {path.parent.name for path in read if path.parent.parent.name == ".records"} == {"000003"}
+    header = read_json(tmp_path / "d" / "dataset.json")
+    assert header["counts"] == {"images": 4, "instances": 4}
+    shutil.rmtree(tmp_path / "d" / "train_synthetless" / "000001")
+    dataset.finish()
+    assert len(records.read_scene_json(dataset.scene(1).scene_gt)) == 1, "in the end everything is looked at"
+
+
+@pytest.mark.parametrize("name", [".DS_Store", "000003 copy.json", "Thumbs.db", "3.json", "000003.json.bak"])
+def test_stray_files_beside_the_records_are_no_images(
+    tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel], name: str
+) -> None:
+    dataset = DatasetStore.open(tmp_path / "d", recipe, models, "")
+    dataset.commit(_image(0))
+    for folder in (".records", ".records/000001"):
+        (tmp_path / "d" / folder / name).write_text("{}")
+    dataset.finish()
+    assert dataset.done() == {0}
+    assert read_json(tmp_path / "d" / "dataset.json")["counts"] == {"images": 1, "instances": 1}
 
 
 def test_labels_follow_from_poses_and_symmetries(
     tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel]
 ) -> None:
-    dataset = Dataset.open(tmp_path / "d", recipe, models, "")
+    dataset = DatasetStore.open(tmp_path / "d", recipe, models, "")
     dataset.commit(_image(0))
     dataset.assemble()
     scene = dataset.scene(1)
@@ -126,12 +163,12 @@ def test_labels_follow_from_poses_and_symmetries(
 
 
 def test_more_images_extend_a_dataset(tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel]) -> None:
-    dataset = Dataset.open(tmp_path / "d", recipe, models, "")
+    dataset = DatasetStore.open(tmp_path / "d", recipe, models, "")
     dataset.commit(_image(0))
     dataset.assemble()
-    more = Dataset.open(tmp_path / "d", recipe.model_copy(update={"images": 6}), models, "")
+    more = DatasetStore.open(tmp_path / "d", recipe.model_copy(update={"images": 6}), models, "")
     assert more.missing() == [1, 2, 3, 4, 5]
-    fewer = Dataset.open(tmp_path / "d", recipe.model_copy(update={"images": 1}), models, "")
+    fewer = DatasetStore.open(tmp_path / "d", recipe.model_copy(update={"images": 1}), models, "")
     assert fewer.missing() == [1, 2, 3], "a smaller number takes nothing away"
 
 
@@ -139,22 +176,22 @@ def test_more_images_extend_a_dataset(tmp_path: Path, recipe: Recipe, models: di
 def test_another_recipe_is_refused(
     tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel], key: str, value: object
 ) -> None:
-    Dataset.open(tmp_path / "d", recipe, models, "")
+    DatasetStore.open(tmp_path / "d", recipe, models, "")
     before = contents(tmp_path / "d")
     with pytest.raises(DatasetError, match=key):
-        Dataset.open(tmp_path / "d", recipe.model_copy(update={key: value}), models, "")
+        DatasetStore.open(tmp_path / "d", recipe.model_copy(update={key: value}), models, "")
     assert contents(tmp_path / "d") == before
 
 
 def test_other_models_or_photographs_are_refused(
     tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel]
 ) -> None:
-    Dataset.open(tmp_path / "d", recipe, models, "")
+    DatasetStore.open(tmp_path / "d", recipe, models, "")
     with pytest.raises(DatasetError, match="scenery_digest"):
-        Dataset.open(tmp_path / "d", recipe, models, "other")
+        DatasetStore.open(tmp_path / "d", recipe, models, "other")
     models[1].path.write_bytes(models[1].path.read_bytes() + b"\n")
     with pytest.raises(DatasetError, match="models_sha256"):
-        Dataset.open(tmp_path / "d", recipe, models, "")
+        DatasetStore.open(tmp_path / "d", recipe, models, "")
 
 
 def test_a_foreign_folder_is_left_alone(tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel]) -> None:
@@ -162,10 +199,10 @@ def test_a_foreign_folder_is_left_alone(tmp_path: Path, recipe: Recipe, models: 
     foreign.mkdir()
     (foreign / "thesis.tex").write_text("dear")
     with pytest.raises(DatasetError, match=r"thesis\.tex"):
-        Dataset.open(foreign, recipe, models, "")
+        DatasetStore.open(foreign, recipe, models, "")
     assert contents(foreign) == {"thesis.tex": b"dear"}
     with pytest.raises(DatasetError, match="cannot be used"):
-        Dataset.open(foreign / "thesis.tex" / "d", recipe, models, "")
+        DatasetStore.open(foreign / "thesis.tex" / "d", recipe, models, "")
 
 
 def test_two_generators_in_one_folder_are_told(tmp_path: Path) -> None:
@@ -198,7 +235,7 @@ def test_parts_share_every_drop_once() -> None:
 
 
 def test_lost_records_are_told(tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel]) -> None:
-    dataset = Dataset.open(tmp_path / "d", recipe, models, "")
+    dataset = DatasetStore.open(tmp_path / "d", recipe, models, "")
     dataset.commit(_image(0))
     dataset.assemble()
     next((tmp_path / "d" / ".records").rglob("*.json")).unlink()
@@ -210,7 +247,7 @@ def test_a_full_disk_leaves_no_image_behind(
     tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """/dev/full refuses every byte, as a full disk does."""
-    dataset = Dataset.open(tmp_path / "d", recipe, models, "")
+    dataset = DatasetStore.open(tmp_path / "d", recipe, models, "")
     rgb = dataset.scene(1).root / "rgb"
     rgb.mkdir(parents=True)
     image = _image(0)
@@ -229,3 +266,25 @@ def test_the_plan_is_a_bijection() -> None:
         assert len({(p.drop, p.view) for p in plans}) == 2500
         assert len({(p.scene_id, p.im_id) for p in plans}) == 2500
         assert all(p.view < views and p.im_id < 1000 and p.scene_id >= 1 for p in plans)
+
+
+def test_a_dataset_begun_before_a_setting_existed_is_continued(
+    tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel]
+) -> None:
+    DatasetStore.open(tmp_path / "d", recipe, models, "")
+    path = tmp_path / "d" / "dataset.json"
+    header = json.loads(path.read_text())
+    del header["recipe"]["labels"]["visibility_delta_mm"]
+    path.write_text(json.dumps(header))
+    assert DatasetStore.open(tmp_path / "d", recipe, models, "").recipe == recipe
+
+
+@pytest.mark.parametrize("damaged", [None, {}, {"images": "many"}, {"imagse": 3}])
+def test_a_damaged_recipe_is_told(
+    tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel], damaged: object
+) -> None:
+    DatasetStore.open(tmp_path / "d", recipe, models, "")
+    path = tmp_path / "d" / "dataset.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "recipe": damaged}))
+    with pytest.raises(DatasetError if damaged == {} else UserError, match=r"dataset\.json: "):
+        DatasetStore.open(tmp_path / "d", recipe, models, "")

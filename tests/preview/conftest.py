@@ -12,7 +12,7 @@ import pytest
 from valid_dataset import write_dataset, write_models
 
 from synthetless.dataset.layout import DATASET_FILE, ScenePaths, scene_ids
-from synthetless.dataset.reader import ImageLabels, read_scene
+from synthetless.dataset.reader import ImageEntries, read_entries
 from synthetless.preview import write_preview
 from tests.preview import chromium
 
@@ -26,7 +26,7 @@ class SmallImage:
 
     key: str
     scene: ScenePaths
-    labels: ImageLabels
+    labels: ImageEntries
 
 
 def images_of(dataset: Path) -> list[SmallImage]:
@@ -35,7 +35,7 @@ def images_of(dataset: Path) -> list[SmallImage]:
     return [
         SmallImage(f"{scene.root.name}/{labels.im_id:06d}", scene, labels)
         for scene in scenes
-        for labels in read_scene(scene)
+        for labels in read_entries(scene)
     ]
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from synthetless.generation.rerender import read_recorded
+from synthetless.dataset.reader import read_specs
 from synthetless.io.images import decode_rgb
 from synthetless.preview.pages import write_pages
 from tests.preview.chromium import console, requested
@@ -142,7 +142,7 @@ def test_the_recorded_scene_is_told(open_page: Any, small_dataset: Path) -> None
     image = images_of(small_dataset)[4]
     _open(open_page, image.key)
     told = _css(open_page, "#sections")[0].text
-    recorded = read_recorded(image.scene)[image.labels.im_id]
+    recorded = read_specs(image.scene)[image.labels.im_id]
     assert f"{recorded.scene.light.elevation_deg:.1f}°" in told
     assert f"{recorded.scene.views[recorded.view].distance_m:.3f} m" in told
     assert f"{recorded.scene.plane.texture.family}, seed {recorded.scene.plane.texture.seed}" in told

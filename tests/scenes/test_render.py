@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from synthetless.annotation.instances import ImageAnnotation, PosedModel
 from synthetless.annotation.raycast import Plane, RayCaster
+from synthetless.annotation.scene import scene_caster
 from synthetless.config import load_recipe
 from synthetless.io.models import ObjectModel, load_models
 from synthetless.scenes.render import BlenderSession
@@ -111,7 +112,7 @@ def test_pixels_and_poses_agree_for_any_camera(name: str, tmp_path: Path) -> Non
         table_size_m=6.0,
         log=tmp_path / "log",
     )
-    caster = RayCaster(meshes)
+    caster = RayCaster({("model", key): mesh for key, mesh in meshes.items()})
     compared = 0
     for drop in range(2):
         overrides = ["objects.count=[7, 9]", "camera.distance_m=[0.5, 0.8]", "camera.roll_deg=[-180, 180]"]
@@ -138,7 +139,7 @@ def _agreement_of_models(models: dict[int, ObjectModel], camera: Intrinsics, fol
         table_size_m=6.0,
         log=folder / "log",
     )
-    caster = RayCaster({key: (model.vertices_mm, model.faces) for key, model in models.items()})
+    caster = scene_caster({"model": models})
     diameters = {key: model.diameter_mm / 1000 for key, model in models.items()}
     compared = 0
     for drop in range(3):

@@ -12,7 +12,7 @@ from damage_kit import CUT, HIDDEN, IMAGE, OTHER, WHOLE, Victim, damage, fringe
 from numpy.typing import NDArray
 
 from synthetless.annotation.instances import PosedModel
-from synthetless.annotation.raycast import RayCaster
+from synthetless.annotation.scene import scene_caster
 from synthetless.dataset.records import read_scene_json
 from synthetless.io.images import encode_mask
 from synthetless.io.models import load_models
@@ -199,7 +199,7 @@ def _silhouette(victim: Victim, instance: int, shift_px: float) -> NDArray[np.bo
     """An instance's silhouette under a principal point that is off, as by a wrong convention of pixel centres."""
     pose = read_scene_json(victim.scene.scene_gt)[IMAGE][instance]
     models = load_models(victim.root / "models", (pose["obj_id"],))
-    caster = RayCaster({obj_id: (model.vertices_mm, model.faces) for obj_id, model in models.items()})
+    caster = scene_caster({"model": models})
     camera = Intrinsics(128, 96, 300.0, 298.0, 63.2 + shift_px, 47.7 + shift_px)
     posed = PosedModel(pose["obj_id"], np.reshape(pose["cam_R_m2c"], (3, 3)), np.array(pose["cam_t_m2c"]))
     return caster.annotate(camera, None, [posed]).instances[0].mask

@@ -95,10 +95,8 @@ def digest_of_other_symmetries(victim: Victim) -> None:
 
 @damage("stale", "/symmetries.json")
 def interrupted_relabelling(victim: Victim) -> None:
-    """Killed after the decision, before the last file was in its place (see synthetless.dataset.changes)."""
-    left = victim.root / ".relabel" / "dataset.json"
-    left.parent.mkdir()
-    shutil.copy(victim.root / "dataset.json", left)
+    """Killed while files took their places (see synthetless.dataset.relabel)."""
+    shutil.copy(victim.root / "symmetries.json", victim.root / ".symmetries.json")
 
 
 # --- dataset.json and models ---

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from damage_kit import IMAGE, WHOLE, Victim
 
-from synthetless.dataset.adopt import adopt
 from synthetless.dataset.records import read_scene_json, write_scene_json
+from synthetless.dataset.relabel import adopt
 from synthetless.validation import validate
 
 OURS = ("dataset.json", "symmetries.json", "scene_gt_canonical.json", "scene_spec.jsonl")

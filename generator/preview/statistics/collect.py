@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from synthetless.dataset.layout import ScenePaths, scene_ids
-from synthetless.dataset.reader import ImageLabels, read_scene
-from synthetless.generation.rerender import RecordedImage, read_recorded
+from synthetless.dataset.reader import ImageEntries, read_entries, read_specs
+from synthetless.dataset.records import ImageSpec
 from synthetless.io import images
 from synthetless.io.color import srgb
 from synthetless.io.files import read_bytes
@@ -74,8 +74,8 @@ def collect(dataset: Path, split: str, luminance_images: int) -> Observations:
     gathered = _Gathered()
     scenes = [ScenePaths.of(dataset, scene_id, split) for scene_id in scene_ids(dataset, split)]
     for scene in tqdm(scenes, desc="statistics", unit="scene", disable=None, leave=False):
-        recorded = read_recorded(scene) if scene.scene_spec.exists() else {}
-        for labels in read_scene(scene):
+        recorded = read_specs(scene) if scene.scene_spec.exists() else {}
+        for labels in read_entries(scene):
             gathered.add(scene, labels, recorded.get(labels.im_id))
     return gathered.observations(luminance_images)
 
@@ -91,7 +91,7 @@ class _Gathered:
     drops: dict[int, SceneSpec] = field(default_factory=dict)
     pictures: list[Path] = field(default_factory=list)
 
-    def add(self, scene: ScenePaths, labels: ImageLabels, recorded: RecordedImage | None) -> None:
+    def add(self, scene: ScenePaths, labels: ImageEntries, recorded: ImageSpec | None) -> None:
         self.objects.append(len(labels.gt))
         for gt, info, canonical in zip(labels.gt, labels.gt_info, labels.gt_canonical, strict=True):
             poses = gt["cam_R_m2c"], gt["cam_t_m2c"]

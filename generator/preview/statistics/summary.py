@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from synthetless.dataset.layout import DATASET_FILE, SYMMETRIES_FILE, find_split
-from synthetless.generation.rerender import read_recipe
+from synthetless.dataset.reader import read_recipe
 from synthetless.preview.statistics import sphere
 from synthetless.preview.statistics.collect import Observations, collect
 from synthetless.preview.statistics.distributions import Distribution, distributions, labelled_classes

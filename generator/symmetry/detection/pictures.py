@@ -93,7 +93,7 @@ class _Views:
         self._surface = Surface(mesh.vertices_mm, mesh.faces, PIECE * mesh.diameter_mm)
         self._samples = self._surface.sampled(_SAMPLES)
         self._tree = cKDTree(self._samples)
-        caster = RayCaster({0: (mesh.vertices_mm, mesh.faces)})
+        caster = RayCaster({("model", 0): (mesh.vertices_mm, mesh.faces)})
         self._seen = [
             caster.annotate(c.pinhole, None, [PosedModel(0, c.R, c.t)], normals=True, object_coordinates=True)
             for c in self._cameras

@@ -1,0 +1,92 @@
+"""From a settled scene and a camera to what is seen: the one way in which images are annotated and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synthetless.annotation.instances import ImageAnnotation, MeshKey, PosedModel
+from synthetless.annotation.raycast import Plane, RayCaster
+from synthetless.config import Recipe
+from synthetless.io.images import has_depth
+from synthetless.io.models import ObjectModel
+from synthetless.scenes.camera import extrinsics, settled_centre
+from synthetless.scenes.rotations import matrix
+from synthetless.scenes.spec import Pose, Role, SceneSpec
+
+MM_PER_M = 1000.0
+
+
+@dataclass(frozen=True, eq=False)
+class AnnotatedScene:
+    """One view of a settled scene, measured.
+
+    Attributes:
+        R_w2c: (3, 3) rotation, world to camera (OpenCV).
+        t_w2c: (3,) translation, millimetres.
+        models: the labelled models of which a pixel could be in the image, hidden or not.
+        numbers: their numbers in the scene's objects.
+        image: what is seen; its instances are those of ``models``.
+    """
+
+    R_w2c: NDArray[np.float64]
+    t_w2c: NDArray[np.float64]
+    models: tuple[PosedModel, ...]
+    numbers: tuple[int, ...]
+    image: ImageAnnotation
+
+
+def scene_caster(models: Mapping[Role, Mapping[int, ObjectModel]]) -> RayCaster:
+    """A ray caster of the models of each role."""
+    meshes: dict[MeshKey, ObjectModel] = {(role, i): model for role, of in models.items() for i, model in of.items()}
+    return RayCaster({key: (model.vertices_mm, model.faces) for key, model in meshes.items()})
+
+
+def annotate_scene(
+    caster: RayCaster, recipe: Recipe, scene: SceneSpec, settled: Sequence[Pose], view: int
+) -> AnnotatedScene:
+    """Measure one view of a scene: poses, depth, masks, visibility.
+
+    A model that no pixel of the image could show, were it alone, gets no label.
+
+    Args:
+        caster: of every mesh in the scene, by role and object id.
+        recipe: the camera, the table's size, and what is measured.
+        scene: what was built.
+        settled: pose at rest of each of its objects, world frame, metres.
+        view: which of its views.
+
+    Raises:
+        ValueError: a mesh is not among the caster's.
+    """
+    R_w2c, t_w2c_m = extrinsics(scene.views[view], settled_centre(settled))
+    t_w2c = t_w2c_m * MM_PER_M
+    posed = [
+        PosedModel(item.obj_id, *model_to_camera(pose, R_w2c, t_w2c), item.role)
+        for item, pose in zip(scene.objects, settled, strict=True)
+    ]
+    labelled = [number for number, model in enumerate(posed) if model.role == "model"]
+    image = caster.annotate(
+        recipe.intrinsics,
+        Plane(R_w2c, t_w2c, recipe.table.size_m * MM_PER_M / 2),
+        [posed[number] for number in labelled],
+        [model for model in posed if model.role != "model"],
+        recipe.labels.visibility_delta_mm,
+        "normals" in recipe.outputs,
+        "object_coordinates" in recipe.outputs,
+    )
+    if "depth" in recipe.outputs:
+        image = image.where_valid(has_depth(image.depth_mm, recipe.encoding.depth_scale))
+    inside = [n for n, instance in enumerate(image.instances) if instance.mask.any()]
+    numbers = tuple(labelled[n] for n in inside)
+    return AnnotatedScene(R_w2c, t_w2c, tuple(posed[n] for n in numbers), numbers, image.restricted(inside))
+
+
+def model_to_camera(
+    pose: Pose, R_w2c: NDArray[np.float64], t_w2c: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """R_m2c (3, 3) and t_m2c (3,) in millimetres of a pose in the world (metres), under a camera in millimetres."""
+    return R_w2c @ matrix(pose.rotation_wxyz), R_w2c @ (np.array(pose.position_m) * MM_PER_M) + t_w2c
