@@ -188,6 +188,12 @@ def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return content
 
 
+def nearest_existing(folder: Path) -> Path:
+    """The folder itself, or the innermost of its parents that exists."""
+    absolute = folder.absolute()
+    return next(place for place in (absolute, *absolute.parents) if place.is_dir())
+
+
 class LockedError(UserError):
     """Another process is at work in the folder; the message is one line."""
 
@@ -256,12 +262,20 @@ def _flock(path: Path, mode: int, busy: str) -> Iterator[None]:
         try:
             fcntl.flock(lock, mode)
             taken_away = not os.path.samestat(path.stat(), os.fstat(lock.fileno()))
-        except OSError:
+        except BlockingIOError:
             raise LockedError(busy) from None
+        except FileNotFoundError:
+            taken_away = True
+        except OSError as error:
+            raise UserError(
+                f"{path}: this file system cannot lock files ({error.strerror}); "
+                "give a folder on another one, or mount it with locks (Lustre: -o flock)"
+            ) from None
         if taken_away:
             raise LockedError(busy)
         try:
             yield
         finally:
             if mode & fcntl.LOCK_EX:
-                path.unlink(missing_ok=True)
+                with suppress(OSError):  # the folder may have become read-only; the file alone locks nobody out
+                    path.unlink()
