@@ -84,7 +84,7 @@ def detect_command(
     if models_out is not None:
         detected.write_models(models_out)
     if pictures is not None:
-        from synthetless.symmetry.detection.gallery import draw_detected
+        from synthetless.symmetry.detection.pictures import draw_detected
 
         draw_detected(detected, pictures, workers)
     say(json.dumps(detected.to_json()) if as_json else report(detected))
@@ -99,11 +99,12 @@ def show_command(
 
     Regressors, margins, and which views are dangerous.
     """
-    from synthetless.symmetry.detection.show import describe, read_table
+    from synthetless.symmetry import SymmetryTable
+    from synthetless.symmetry.detection.report import describe
 
-    read = read_table(table)
+    read = SymmetryTable.read(table)
     if pictures is not None:
-        from synthetless.symmetry.detection.gallery import draw_table
+        from synthetless.symmetry.detection.pictures import draw_table
 
         draw_table(read, models or (table if table.is_dir() else table.parent), pictures)
     say(describe(read))

@@ -20,7 +20,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from synthetless.dataset.labels import (
@@ -43,6 +42,7 @@ from synthetless.dataset.layout import (
 from synthetless.dataset.reader import read_recipe
 from synthetless.dataset.records import CanonicalEntry, GtEntry, ModelInfo, read_scene_json
 from synthetless.errors import UserError
+from synthetless.io.documents import read_document
 from synthetless.io.files import atomic_write, json_bytes, locked, read_bytes, read_json, replace_file, write_json
 from synthetless.io.models import INFO_FILE, read_models_info
 from synthetless.io.parallel import each
@@ -266,7 +266,7 @@ def revised(
         raise UserError(
             f"{symmetries}: object {strangers[0]} is none of the dataset's objects {', '.join(map(str, obj_ids))}"
         )
-    stated = _keys(symmetries)
+    stated = read_document(symmetries)
     return SymmetryTable(
         {**table.entries, **other.entries},
         scheme or (other if "scheme" in stated else table).scheme,
@@ -443,15 +443,6 @@ def _rotations(labels: Sequence[CanonicalEntry]) -> NDArray[np.float64]:
 
 def _arrow(before: object, after: object) -> str:
     return f"{before}" if before == after else f"{before} -> {after}"
-
-
-def _keys(path: Path) -> set[str]:
-    """What a symmetry table states at its top level."""
-    text = read_bytes(path)
-    try:
-        return set(json.loads(text))
-    except ValueError:
-        return set(yaml.safe_load(text))
 
 
 def _differing(before: SymmetryTable, after: SymmetryTable) -> frozenset[int]:

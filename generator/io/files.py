@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import socket
+import stat
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -138,14 +139,24 @@ def read_json_lines(path: Path) -> list[Any]:
     return [_parse(line, f"{path}, line {number}") for number, line in enumerate(lines, start=1)]
 
 
-def read_bytes(path: Path) -> bytes:
-    """The content of a file.
+def read_bytes(path: Path, at_most: int | None = None) -> bytes:
+    """The content of a regular file.
+
+    Args:
+        path: of the file, or of a link to one.
+        at_most: its largest size.
 
     Raises:
-        UserError: it is missing or unreadable.
+        UserError: it is missing, unreadable, larger, or something else, such as a pipe that never ends.
     """
     try:
-        return path.read_bytes()
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:  # no waiting at a pipe
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise UserError(f"{path}: is no regular file")
+            if at_most is not None and status.st_size > at_most:
+                raise UserError(f"{path}: has {status.st_size} bytes; at most {at_most} are read")
+            return file.read()
     except FileNotFoundError:
         raise UserError(f"{path}: not found") from None
     except OSError as error:
@@ -161,12 +172,15 @@ def _line(path: Path, value: Any) -> str:
 
 def _parse(data: bytes, place: str) -> Any:
     try:
-        return json.loads(data, object_pairs_hook=_unique)
+        return json.loads(data, object_pairs_hook=unique_keys)
+    except RecursionError:
+        raise UserError(f"{place}: is nested too deeply") from None
     except ValueError as error:  # JSONDecodeError, UnicodeDecodeError and the hook's own
         raise UserError(f"{place}: not valid JSON, cut off or damaged ({error})") from None
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """For ``json.loads``: an object, a ValueError if it names a key twice."""
     content = dict(pairs)
     if len(content) < len(pairs):
         keys = [key for key, _ in pairs]

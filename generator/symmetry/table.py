@@ -17,7 +17,7 @@ import difflib
 import hashlib
 import json
 import re
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +34,9 @@ from synthetless.symmetry.canonical import CanonicalMap
 from synthetless.symmetry.groups import SymmetryGroup
 
 Matrix = tuple[tuple[float, ...], ...]
+
+TABLE_FILE = "symmetries.json"
+MODELS_INFO_FILE = "models_info.json"
 
 _TABLE_KEYS = ("scheme", "allocentric", "objects")
 _GIVEN_KEYS = ("group", "axis", "secondary_axis", "frame", "offset", "offset_mm", "reference_rotation")
@@ -80,22 +83,46 @@ class SymmetryTable:
         object.__setattr__(self, "entries", MappingProxyType(ordered))
 
     @classmethod
-    def from_models_info(
-        cls, models_info: Mapping[Any, Mapping[str, Any]], scheme: Scheme = "pitteri2019", allocentric: bool = False
-    ) -> Self:
+    def from_models_info(cls, models_info: object, scheme: Scheme = "pitteri2019", allocentric: bool = False) -> Self:
         """The table of the groups that BOP's `models_info.json` declares (keys: object ids as int or str).
 
         Raises:
             UserError: an entry that describes no rotation group, with the object's id.
         """
-        entries = {}
-        for key, info in models_info.items():
-            obj_id = _object_id(key)
-            try:
-                entries[obj_id] = SymmetryEntry(SymmetryGroup.from_bop(info))
-            except ValueError as error:
-                raise UserError(f"object {obj_id}: {error}") from error
-        return cls(entries, scheme, allocentric)
+        declared, faults = cls.declared(models_info, scheme=scheme, allocentric=allocentric)
+        if faults:
+            raise UserError(next(iter(faults.values())))
+        return declared
+
+    @classmethod
+    def declared(
+        cls,
+        models_info: object,
+        but: Collection[int] = (),
+        scheme: Scheme = "pitteri2019",
+        allocentric: bool = False,
+    ) -> tuple[Self, dict[int, str]]:
+        """The table of those groups in BOP's `models_info.json` that can be read, and what is wrong with the others.
+
+        Args:
+            models_info: the file's content.
+            but: objects whose entries are not looked at.
+            scheme, allocentric: of the table.
+
+        Returns:
+            The table, and one line for each object whose entry describes no rotation group, by id.
+
+        Raises:
+            UserError: it is not a mapping of object ids to entries, or names an object twice.
+        """
+        entries, faults = {}, {}
+        for obj_id, info in _by_id(models_info, f"{MODELS_INFO_FILE} maps object ids to diameters and boxes").items():
+            if obj_id not in but:
+                try:
+                    entries[obj_id] = SymmetryEntry(SymmetryGroup.from_bop(info, f"object {obj_id}"))
+                except UserError as error:
+                    faults[obj_id] = f"object {obj_id}: {error}"
+        return cls(entries, scheme, allocentric), faults
 
     @classmethod
     def from_dict(cls, data: object) -> Self:
@@ -113,36 +140,35 @@ class SymmetryTable:
         objects = data.get("objects", {key: value for key, value in data.items() if key not in _TABLE_KEYS})
         if "objects" in data:
             _refuse_unknown(data, _TABLE_KEYS, "the symmetry table")
-        if not isinstance(objects, Mapping):
-            raise UserError(f"objects is {objects!r}, not a mapping of object ids to groups")
         scheme, allocentric = data.get("scheme", SCHEMES[0]), data.get("allocentric", False)
         _check_scheme(scheme)
         if not isinstance(allocentric, bool):
             raise UserError(f"allocentric is {allocentric!r}, not true or false")
-        entries: dict[int, SymmetryEntry] = {}
-        for key, value in objects.items():
-            obj_id = _object_id(key)
-            if obj_id in entries:
-                raise UserError(f"object {obj_id} is listed twice")
+        entries = {}
+        for obj_id, value in _by_id(objects, f"objects is {objects!r}, not a mapping of object ids to groups").items():
             try:
-                entries[obj_id] = _entry(value, scheme)
-            except ValueError as error:
+                entries[obj_id] = _entry(value, scheme, f"object {obj_id}")
+            except UserError as error:
                 raise UserError(f"object {obj_id}: {error}") from error
         return cls(entries, scheme, allocentric)
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """The table in a YAML or JSON file.
+        """The table in a YAML or JSON file, in BOP's `models_info.json`, or in a folder that holds one of these.
+
+        Of a folder `symmetries.json` is taken, or else `models_info.json`.
 
         Raises:
-            UserError: the file cannot be read, is neither JSON nor YAML, or what `from_dict` refuses; with the file's
-                name.
+            UserError: the file cannot be found or read, is neither JSON nor YAML, or what `from_dict` refuses; with
+                the file's name.
         """
-        data = read_bytes(Path(path))
+        file = _file_of(Path(path))
+        data = read_bytes(file)
         try:
-            return cls.from_dict(_parsed(data.decode()))
+            content = _parsed(data.decode())
+            return cls.from_models_info(content) if file.name == MODELS_INFO_FILE else cls.from_dict(content)
         except ValueError as error:
-            raise UserError(f"{path}: {error}") from error
+            raise UserError(f"{file}: {error}") from error
 
     def write(self, path: str | Path) -> None:
         """Write the table as JSON (which is YAML as well), always the same bytes, whole or not at all.
@@ -196,14 +222,27 @@ def _derived(entry: SymmetryEntry, scheme: Scheme) -> dict[str, Any]:
     }
 
 
-def _entry(value: object, scheme: Scheme) -> SymmetryEntry:
+def _by_id(objects: object, otherwise: str) -> dict[int, Any]:
+    """The values of a mapping by object id."""
+    if not isinstance(objects, Mapping):
+        raise UserError(otherwise)
+    by_id: dict[int, Any] = {}
+    for key, value in objects.items():
+        obj_id = _object_id(key)
+        if obj_id in by_id:
+            raise UserError(f"object {obj_id} is listed twice")
+        by_id[obj_id] = value
+    return by_id
+
+
+def _entry(value: object, scheme: Scheme, what: str) -> SymmetryEntry:
     if isinstance(value, str):
         return SymmetryEntry(SymmetryGroup.from_name(value))
     if not isinstance(value, Mapping):
         raise UserError(f"{value!r} describes no symmetries; write for example {{group: C2, axis: [0, 0, 1]}}")
-    if value and value.keys() <= set(_BOP_KEYS):
-        return SymmetryEntry(SymmetryGroup.from_bop(value))
-    _refuse_unknown(value, _GIVEN_KEYS + _DERIVED_KEYS, "it")
+    if "group" not in value and not value.keys().isdisjoint(_BOP_KEYS):
+        return SymmetryEntry(SymmetryGroup.from_bop(value, what))
+    _refuse_unknown(value, _GIVEN_KEYS + _DERIVED_KEYS, "it", suggested=_BOP_KEYS)
     if "group" not in value:
         raise UserError("it has no group; write for example {group: C2, axis: [0, 0, 1]}")
     if "offset" in value and "offset_mm" in value:
@@ -259,15 +298,28 @@ def _object_id(key: object) -> int:
     return int(matched[1])
 
 
-def _refuse_unknown(mapping: Mapping[Any, Any], known: Iterable[str], where: str) -> None:
+def _refuse_unknown(
+    mapping: Mapping[Any, Any], known: Sequence[str], where: str, suggested: Sequence[str] = ()
+) -> None:
     for key in mapping:
         if key not in known:
-            raise UserError(f"{where} has the unknown key {str(key)!r}{_suggestion(str(key), known)}")
+            raise UserError(f"{where} has the unknown key {str(key)!r}{_suggestion(str(key), [*known, *suggested])}")
 
 
 def _suggestion(word: str, known: Iterable[str]) -> str:
     nearest = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
     return f": did you mean {nearest[0]!r}?" if nearest else ""
+
+
+def _file_of(path: Path) -> Path:
+    if not path.is_dir():
+        return path
+    found = [path / name for name in (TABLE_FILE, MODELS_INFO_FILE) if (path / name).exists()]
+    if not found:
+        raise UserError(
+            f"{path}: holds neither {TABLE_FILE} nor {MODELS_INFO_FILE}; symmetries detect can write a table"
+        )
+    return found[0]
 
 
 def _check_scheme(scheme: object) -> None:
