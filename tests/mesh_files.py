@@ -100,11 +100,11 @@ def binary_ply(solid: Solid, order: str = "<", face_extras: bool = False, edges:
     points = [(1e6, -1e6, 1e6)] * stray + list(solid.points)
     body = b"".join(struct.pack(f"{order}3fBd", *p, 7, 0.5) for p in points)
     body += struct.pack(f"{order}{2 * edges}i", *range(2 * edges))
+    rows = []
     for p in solid.polygons:
-        if face_extras:
-            body += struct.pack(f"{order}BB{2 * len(p)}f", 1, 2 * len(p), *([0.25] * (2 * len(p))))
-        body += struct.pack(f"{order}B{len(p)}I", len(p), *(stray + i for i in p))
-    return "\n".join(head).encode() + body
+        extras = struct.pack(f"{order}BB{2 * len(p)}f", 1, 2 * len(p), *([0.25] * (2 * len(p)))) if face_extras else b""
+        rows.append(extras + struct.pack(f"{order}B{len(p)}I", len(p), *(stray + i for i in p)))
+    return "\n".join(head).encode() + body + b"".join(rows)
 
 
 def obj(solid: Solid, corner: str = "{0}", relative: bool = False) -> bytes:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 import stat
+import struct
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -287,55 +288,38 @@ class _Element:
         """The place of the property of one of these names, -1 if there is none."""
         return next((i for i, p in enumerate(self.properties) if p.name in names), -1)
 
-
-class _PlyBody:
-    """What follows the header of a PLY file; elements are read one after the other."""
-
-    def rows(self, element: _Element, wanted: Sequence[int]) -> tuple[Floats, Ints]:
-        """The values of some properties in all rows.
-
-        Returns:
-            All values, row after row, and how many each row has, (count,).
-
-        Raises:
-            _Fault: the file is cut off, or a row is not what the header says.
-        """
-        raise NotImplementedError
-
-    def is_at_end(self) -> bool:
-        """Whether nothing follows what was read."""
-        raise NotImplementedError
+    def cut_off(self, row: int) -> _Fault:
+        return _Fault(f"cut off after {row} of {self.count} rows of {self.name}")
 
 
 def _read_ply(data: bytes) -> _Polygons:
-    header, order, elements, start = _ply_header(data)
-    body = _AsciiBody(data[start:], header.count(b"\n") + 1) if order == "" else _BinaryBody(data, start, order)
+    header, order, elements = _ply_header(data)
+    body = _AsciiBody(data, header) if order == "" else _BinaryBody(data, header, order)
     vertices, corners, sizes = np.empty((0, 3)), np.empty(0), np.empty(0, np.int64)
     for element in elements:
-        wanted: list[int] = []
-        if element.name == "vertex":
-            wanted = [element.column(axis) for axis in "xyz"]
-            if -1 in wanted:
-                raise _Fault("its vertices have no properties x, y and z")
-        elif element.name == "face":
-            wanted = [element.column(*_FACE_LISTS)]
-            if element.count and (wanted[0] < 0 or element.properties[wanted[0]].length_type is None):
-                raise _Fault(f"its faces have no list called {' or '.join(_FACE_LISTS)}")
-        elif element.name == "tristrips":
+        table = body.read(element)
+        if element.name == "tristrips":
             raise _Fault("holds triangle strips; save it with faces instead")
-        values, counts = body.rows(element, wanted if element.count else [])
+        if element.count == 0:
+            continue
         if element.name == "vertex":
-            vertices = values.reshape(-1, 3)
+            columns = [element.column(axis) for axis in "xyz"]
+            if -1 in columns or any(element.properties[i].length_type for i in columns):
+                raise _Fault("its vertices have no properties x, y and z")
+            vertices = np.column_stack([table.values(i) for i in columns])
         elif element.name == "face":
-            corners, sizes = values, counts
+            column = element.column(*_FACE_LISTS)
+            if column < 0 or element.properties[column].length_type is None:
+                raise _Fault(f"its faces have no list called {' or '.join(_FACE_LISTS)}")
+            corners, sizes = table.values(column), table.lengths[column]
     numbers = corners.astype(np.int64)
     if (numbers != corners).any():
         raise _Fault(f"a face names vertex {corners[numbers != corners][0]:g}; whole numbers are needed")
     return _Polygons(vertices, numbers, sizes, header.isascii() and b"\r" not in header and body.is_at_end())
 
 
-def _ply_header(data: bytes) -> tuple[bytes, str, list[_Element], int]:
-    """The header, the byte order ("" for text), the elements, and where the body begins."""
+def _ply_header(data: bytes) -> tuple[bytes, str, list[_Element]]:
+    """The header, the byte order ("" for text), and the elements."""
     opening = re.match(rb"ply[ \t]*(\r\n|\n|\r)", data)
     if not opening:
         raise _Fault("is empty" if not data.strip() else "not a PLY file: it does not begin with the line 'ply'")
@@ -350,7 +334,7 @@ def _ply_header(data: bytes) -> tuple[bytes, str, list[_Element], int]:
         match line.split():
             case ["format", name, *_] if name in _PLY_ORDERS:
                 order = _PLY_ORDERS[name]
-            case ["element", name, count] if re.fullmatch(r"\d{1,18}", count, re.ASCII):
+            case ["element", name, count] if re.fullmatch(r"[0-9]{1,18}", count):
                 elements.append(_Element(name, int(count), ()))
             case ["property", "list", length, kind, name] if elements and {length, kind} <= _PLY_TYPES.keys():
                 elements[-1] = _with(elements[-1], _Property(name, _PLY_TYPES[kind], _PLY_TYPES[length]))
@@ -362,175 +346,188 @@ def _ply_header(data: bytes) -> tuple[bytes, str, list[_Element], int]:
                 raise _Fault(f"line {number} of the header is not understood: {line[:60]!r}")
     if order is None:
         raise _Fault(f"its header has no format; one of {', '.join(_PLY_ORDERS)} is needed")
-    return header, order, elements, end.end()
+    return header, order, elements
 
 
 def _with(element: _Element, added: _Property) -> _Element:
     return _Element(element.name, element.count, (*element.properties, added))
 
 
-class _AsciiBody(_PlyBody):
+class _Table:
+    """The rows of a PLY element in memory.
+
+    Attributes:
+        lengths: for each property (N,) how many values each row has; 1 unless it is a list.
+        ends: (N,) where the rows end, in bytes.
+    """
+
+    def __init__(
+        self, element: _Element, data: bytes | NDArray[np.uint8], starts: Ints, dtype: Callable[[str], np.dtype[Any]]
+    ) -> None:
+        """Find every value from where the rows start, in bytes; ``dtype`` tells how a type of the header is stored."""
+        self._element, self._data = element, data
+        self._dtypes = [dtype(p.type) for p in element.properties]
+        self._places: list[Ints] = []
+        self.lengths: list[Ints] = []
+        place = starts
+        for p, kind in zip(element.properties, self._dtypes, strict=True):
+            lengths = np.ones_like(place)
+            if p.length_type:
+                inside = np.clip(place, 0, max(len(data) - dtype(p.length_type).itemsize, 0))
+                lengths = self._gather(inside, dtype(p.length_type)).astype(np.int64)
+                place = place + dtype(p.length_type).itemsize
+            self._places.append(place)
+            self.lengths.append(lengths)
+            place = place + lengths * kind.itemsize
+        self.ends = place
+
+    def values(self, column: int) -> Floats:
+        """All values of a property, row after row, as its type holds them: a float has 24 bits."""
+        places, lengths, dtype = self._places[column], self.lengths[column], self._dtypes[column]
+        values: NDArray[Any]
+        if _is_even(places) and (lengths == lengths[0]).all():
+            shape, steps = (len(places), int(lengths[0])), (int(places[-1] - places[-2]), dtype.itemsize)
+            values = np.ndarray(shape, dtype, self._data, int(places[0]), steps).ravel()
+        else:
+            before = np.cumsum(lengths) - lengths
+            within = (np.arange(lengths.sum()) - np.repeat(before, lengths)) * dtype.itemsize
+            values = self._gather(np.repeat(places, lengths) + within, dtype)
+        if self._element.properties[column].type == "f4":
+            values = values.astype(np.float32)
+        return values.astype(np.float64)
+
+    def _gather(self, places: Ints, dtype: np.dtype[Any]) -> NDArray[Any]:
+        """The values that stand at these places."""
+        if _is_even(places):
+            return np.ndarray(len(places), dtype, self._data, int(places[0]), (int(places[1] - places[0]),))
+        if not (places % dtype.itemsize).any():
+            aligned: NDArray[Any] = np.frombuffer(self._data, dtype, len(self._data) // dtype.itemsize)
+            return np.asarray(aligned[places // dtype.itemsize])
+        codes = np.frombuffer(self._data, np.uint8)[places[:, None] + np.arange(dtype.itemsize)]
+        return np.asarray(codes.view(dtype).ravel())
+
+
+def _is_even(places: Ints) -> bool:
+    """Whether there are at least two places, at equal distances."""
+    return len(places) > 1 and places[1] > places[0] and bool((np.diff(places) == places[1] - places[0]).all())
+
+
+class _AsciiBody:
     """Text: a line for each row."""
 
-    def __init__(self, text: bytes, first_line: int) -> None:
+    def __init__(self, data: bytes, header: bytes) -> None:
+        text = data[len(header) :]
         self._text = text if b"\n" in text else text.replace(b"\r", b"\n")
         codes = np.frombuffer(self._text, np.uint8)
-        last = [] if self._text.endswith(b"\n") else [len(text)]
-        self._starts = np.concatenate([[0], np.flatnonzero(codes == ord("\n")) + 1, last]).astype(np.int64)
+        starts = np.concatenate([[0], np.flatnonzero(codes == ord("\n")) + 1]).astype(np.int64)
+        starts = starts[starts < len(text)]
         is_space = codes <= ord(" ")
         begins = ~is_space & np.concatenate([[True], is_space[:-1]])
-        self._words = np.add.reduceat(begins, self._starts[:-1], dtype=np.int64)  # in each line
-        self._first_line = first_line
-        self._line = 0
+        words = np.add.reduceat(begins, starts, dtype=np.int64) if len(starts) else starts
+        filled = np.flatnonzero(words)  # blank lines are passed over
+        self._starts, self._ends = starts[filled], np.append(starts[1:], len(text))[filled]
+        self._words = words[filled]
+        self._numbers = filled + 1 + header.count(b"\n" if b"\n" in header else b"\r")  # of the lines, for messages
+        self._row = 0
 
-    def rows(self, element: _Element, wanted: Sequence[int]) -> tuple[Floats, Ints]:
-        end = self._line + element.count
-        uniform = self._uniform(element, wanted) if end < len(self._starts) else None
-        if not uniform:
-            return self._row_by_row(element, wanted)
-        self._line = end
-        return uniform
+    def read(self, element: _Element) -> _Table:
+        """The next element."""
+        first, self._row = self._row, self._row + element.count
+        rows = slice(first, self._row)
+        words = self._words[rows]
+        text = self._text[self._starts[first] : self._ends[rows][-1]] if len(words) else b""
+        is_whole = all(p.type[0] in "iu" for p in element.properties)
+        numbers = _numbers(text, np.int64) if is_whole else None
+        if numbers is None:
+            numbers = _numbers(text, np.float64)
+        if numbers is None or numbers.size != words.sum():
+            raise self._not_a_number(rows)
+        table = _Table(element, numbers.view(np.uint8), 8 * (np.cumsum(words) - words), lambda _: numbers.dtype)
+        wrong = table.ends != 8 * np.cumsum(words)
+        for lengths in table.lengths:
+            wrong |= lengths < 0
+        if wrong.any():
+            row = int(wrong.argmax())
+            if first + row == len(self._words) - 1 and table.ends[row] > 8 * words[: row + 1].sum():
+                raise element.cut_off(row)
+            raise _Fault(
+                f"line {self._numbers[first + row]} has {words[row]} values, which is not what the header says of "
+                f"{element.name}"
+            )
+        if len(words) < element.count:
+            raise element.cut_off(len(words))
+        return table
 
     def is_at_end(self) -> bool:
-        return True  # readers of text stop after the last row
+        """Whether other readers find nothing more, either: they stop after the last row."""
+        return True
 
-    def _uniform(self, element: _Element, wanted: Sequence[int]) -> tuple[Floats, Ints] | None:
-        """All rows at once if they have the same form, as they have in nearly all files; None otherwise."""
-        end = self._line + element.count
-        text = self._text[self._starts[self._line] : self._starts[end]]
-        first = text.partition(b"\n")[0].split()
-        spans, position = [], 0
-        for p in element.properties:
-            length = 1
-            if p.length_type:
-                if position >= len(first) or not first[position].isdigit():
-                    return None
-                length, position = int(first[position]), position + 1
-            spans.append((position, position + length))
-            position += length
-        if (self._words[self._line : end] != position).any():
-            return None
-        is_whole = all(p.type[0] in "iu" for p in element.properties)
-        numbers = _numbers(text, np.int64 if is_whole else np.float64)
-        if numbers is None or numbers.size != position * element.count:
-            return None
-        table = numbers.reshape(element.count, position)
-        for (low, high), p in zip(spans, element.properties, strict=True):
-            if p.length_type and (table[:, low - 1] != high - low).any():
-                return None
-        columns = [_rounded(table[:, slice(*spans[i])], element.properties[i].type) for i in wanted]
-        values = np.hstack(columns) if columns else np.empty((element.count, 0))
-        return values.ravel(), np.full(element.count, values.shape[1])
-
-    def _row_by_row(self, element: _Element, wanted: Sequence[int]) -> tuple[Floats, Ints]:
-        values: list[Floats] = []
-        counts: list[int] = []
-        for row in range(element.count):
-            found = self._values(element, row)
-            columns = [_rounded(np.array(found[i], dtype=np.float64), element.properties[i].type) for i in wanted]
-            values += columns
-            counts.append(sum(map(len, columns)))
-        return np.concatenate([np.empty(0), *values]), np.array(counts, dtype=np.int64)
-
-    def _values(self, element: _Element, row: int) -> list[list[float]]:
-        """The values of each property in the next line that is not blank."""
-        filled = np.flatnonzero(self._words[self._line :])
-        if len(filled) == 0:
-            raise _cut_off(row, element)
-        line = self._line + int(filled[0])
-        self._line = line + 1
-        place = f"line {self._first_line + line}"
-        words = self._text[self._starts[line] : self._starts[line + 1]].split()
-        numbers = [_number(word, place) for word in words]
-        found: list[list[float]] = []
-        position = 0
-        for p in element.properties:
-            length = 1.0
-            if p.length_type:
-                length = numbers[position] if position < len(numbers) else 0
-                position += 1
-            if not 0 <= length <= len(numbers) - position:
-                break
-            found.append(numbers[position : position + int(length)])
-            position += int(length)
-        if len(found) < len(element.properties) or position != len(numbers):
-            if len(found) < len(element.properties) and len(filled) == 1:
-                raise _cut_off(row, element)
-            raise _Fault(f"{place} has {len(numbers)} values, which is not what the header says of {element.name}")
-        return found
+    def _not_a_number(self, rows: slice) -> _Fault:
+        for start, end, number in zip(self._starts[rows], self._ends[rows], self._numbers[rows], strict=True):
+            for word in self._text[start:end].split():
+                try:
+                    _number(word, f"line {number}")
+                except _Fault as fault:
+                    return fault
+        return _Fault("holds numbers that are not understood")
 
 
-class _BinaryBody(_PlyBody):
+class _BinaryBody:
     """Numbers as in memory."""
 
-    def __init__(self, data: bytes, start: int, order: str) -> None:
-        self._data, self._position, self._order = data, start, order
+    def __init__(self, data: bytes, header: bytes, order: str) -> None:
+        self._data, self._position, self._order = data, len(header), order
 
-    def rows(self, element: _Element, wanted: Sequence[int]) -> tuple[Floats, Ints]:
+    def read(self, element: _Element) -> _Table:
+        """The next element."""
         if element.count == 0 or not element.properties:
-            return np.empty(0), np.zeros(0, np.int64)
-        lengths = self._lengths(element, self._position, 0)
-        dtype = self._row_type(element, lengths)
-        if element.count * dtype.itemsize <= len(self._data) - self._position:
-            table = np.frombuffer(self._data, dtype, element.count, self._position)
-            if all((table[f"n{i}"] == n).all() for i, n in enumerate(lengths) if n is not None):
-                self._position += table.nbytes
-                columns = [table[f"v{i}"].reshape(element.count, -1).astype(np.float64) for i in wanted]
-                values = np.hstack(columns) if columns else np.empty((element.count, 0))
-                return values.ravel(), np.full(element.count, values.shape[1])
-        elif all(n is None for n in lengths):
-            raise _cut_off((len(self._data) - self._position) // dtype.itemsize, element)
-        return self._row_by_row(element, wanted)
+            return self._table(element, np.empty(0, np.int64))
+        first = np.array([self._position])
+        size = int(self._table(element, first).ends[0]) - self._position
+        room = len(self._data) - self._position
+        if not any(p.length_type for p in element.properties) and room < element.count * size:
+            raise element.cut_off(room // size)
+        if 0 < element.count * size <= room:  # all rows of a size, as in nearly all files?
+            starts = self._position + size * np.arange(element.count)
+            table = self._table(element, starts)
+            if (table.ends - starts == size).all() and all((lengths >= 0).all() for lengths in table.lengths):
+                self._position = int(table.ends[-1])
+                return table
+        table = self._table(element, self._walk(element))
+        self._position = int(table.ends[-1])
+        return table
 
     def is_at_end(self) -> bool:
+        """Whether nothing follows what was read."""
         return self._position == len(self._data)
 
-    def _row_by_row(self, element: _Element, wanted: Sequence[int]) -> tuple[Floats, Ints]:
-        values: list[Floats] = []
-        counts: list[int] = []
+    def _dtype(self, kind: str) -> np.dtype[Any]:
+        return np.dtype(self._order + kind)
+
+    def _table(self, element: _Element, starts: Ints) -> _Table:
+        return _Table(element, self._data, starts, self._dtype)
+
+    def _walk(self, element: _Element) -> Ints:
+        """Where each row starts, when their lists differ in length."""
+        steps = [
+            (struct.Struct((self._order + self._dtype(p.length_type).char) if p.length_type else ""), int(p.type[1]))
+            for p in element.properties
+        ]
+        starts, place = [], self._position
         for row in range(element.count):
-            dtype = self._row_type(element, self._lengths(element, self._position, row))
-            if dtype.itemsize > len(self._data) - self._position:
-                raise _cut_off(row, element)
-            found = np.frombuffer(self._data, dtype, 1, self._position)
-            self._position += dtype.itemsize
-            columns = [found[f"v{i}"].ravel().astype(np.float64) for i in wanted]
-            values += columns
-            counts.append(sum(map(len, columns)))
-        return np.concatenate([np.empty(0), *values]), np.array(counts, dtype=np.int64)
-
-    def _lengths(self, element: _Element, position: int, row: int) -> tuple[int | None, ...]:
-        """The lengths of the lists in the row that begins at a position; None for what is no list."""
-        lengths: list[int | None] = []
-        for p in element.properties:
-            length = None
-            if p.length_type:
-                kind = np.dtype(self._order + p.length_type)
-                if position + kind.itemsize > len(self._data):
-                    raise _cut_off(row, element)
-                length = int(np.frombuffer(self._data, kind, 1, position)[0])
-                position += kind.itemsize
-            size = (1 if length is None else length) * int(p.type[1])
-            if size < 0:
-                raise _Fault(f"row {row} of {element.name} has a list of {length} values")
-            if position + size > len(self._data):
-                raise _cut_off(row, element)
-            position += size
-            lengths.append(length)
-        return tuple(lengths)
-
-    def _row_type(self, element: _Element, lengths: Sequence[int | None]) -> np.dtype[Any]:
-        """A row with lists of these lengths: ``v0``, ... for the properties, ``n0``, ... for the lengths."""
-        fields: list[Any] = []
-        for i, (p, length) in enumerate(zip(element.properties, lengths, strict=True)):
-            if length is not None:
-                fields.append((f"n{i}", self._order + str(p.length_type)))
-            fields.append((f"v{i}", self._order + p.type, (1 if length is None else length,)))
-        return np.dtype(fields)
-
-
-def _cut_off(row: int, element: _Element) -> _Fault:
-    return _Fault(f"cut off after {row} of {element.count} rows of {element.name}")
+            starts.append(place)
+            for length_type, width in steps:
+                length = 1
+                if length_type.size:
+                    if place + length_type.size > len(self._data):
+                        raise element.cut_off(row)
+                    (length,) = length_type.unpack_from(self._data, place)
+                if length < 0:
+                    raise _Fault(f"row {row} of {element.name} has a list of {length} values")
+                place += length_type.size + int(length) * width
+            if place > len(self._data):
+                raise element.cut_off(row)
+        return np.array(starts, dtype=np.int64)
 
 
 # STL
@@ -700,11 +697,6 @@ def _coordinates(words: Sequence[bytes], place: str) -> list[float]:
 
 def _table(vertices: list[list[float]]) -> Floats:
     return np.array(vertices, dtype=np.float64).reshape(-1, 3)
-
-
-def _rounded(values: NDArray[Any], kind: str) -> Floats:
-    """What the header's type holds of the values: floats have 24 bits."""
-    return np.asarray(values.astype(np.float32).astype(np.float64) if kind == "f4" else values.astype(np.float64))
 
 
 def _shown(text: bytes) -> str:
