@@ -161,7 +161,7 @@ def _make(dataset: DatasetStore, sources: Sources, missing: list[int], execution
     interval = 0.5 if sys.stderr.isatty() else 60.0
     next_sheet: float = 1 if execution.preview_every else math.inf
     bar = tqdm(total=len(missing), unit="image", mininterval=interval, maxinterval=interval, smoothing=0.05)
-    with bar, closing(_results(dataset, tasks, execution)) as results:  # closed: no worker goes on after an error here
+    with bar, closing(_results(dataset, tasks, execution)) as results:  # closed: no worker continues after an error
         assembled = time.monotonic()
         for result in results:
             bar.update(result.made)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import re
-import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synthetless.errors import UserError
+from synthetless.io.documents import shown
+from synthetless.io.files import read_json
 from synthetless.io.meshes import SUFFIXES, TriangleMesh, read_mesh
 
 INFO_FILE = "models_info.json"
@@ -138,18 +138,22 @@ def read_models_info(folder: Path) -> dict[int, dict[str, Any]]:
     """models_info.json by object id.
 
     Raises:
-        UserError: it is missing, no JSON, or not a mapping of ids to entries.
+        UserError: it is missing, not JSON, names a key twice, or is not a mapping of ids to entries.
     """
     path = folder / INFO_FILE
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return {int(key): dict(entry) for key, entry in content.items()}
-    except FileNotFoundError:
-        raise UserError(f"{path}: not found; a BOP models folder needs it") from None
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise UserError(f"{path}: not a JSON object of object ids and entries ({error})") from None
+    if not path.exists():
+        raise UserError(f"{path}: not found; a BOP models folder needs it")
+    content = read_json(path)
+    entries: dict[int, dict[str, Any]] = {}
+    for key, entry in content.items():
+        if not (key.strip().isascii() and key.strip().isdecimal()):
+            raise UserError(f'{path}: the key {shown(key)} is not an object id, such as "1"')
+        if not isinstance(entry, dict):
+            raise UserError(f"{path}: object {key} is {shown(entry)}, not a mapping of diameter, box and symmetries")
+        if int(key) in entries:
+            raise UserError(f"{path}: object {int(key)} is listed twice, once as {shown(key)}")
+        entries[int(key)] = entry
+    return entries
 
 
 def _find_meshes(folder: Path) -> dict[int, Path]:
@@ -191,5 +195,5 @@ def _length_mm(path: Path, obj_id: int, info: Mapping[str, Any], key: str) -> fl
     if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < _LARGEST_MM:
         return value
     raise UserError(
-        f"{path.parent / INFO_FILE}: object {obj_id} has {key} {reprlib.repr(value)}; a positive number of mm is needed"
+        f"{path.parent / INFO_FILE}: object {obj_id} has {key} {shown(value)}; a positive number of mm is needed"
     )

@@ -114,7 +114,7 @@ def test_a_process_that_has_blender_can_spawn_others(since: str, tmp_path: Path)
     done = subprocess.run(
         [sys.executable, str(script)],
         cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": str(ROOT / "src")},
         capture_output=True,
         text=True,
         timeout=200,

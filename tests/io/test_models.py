@@ -68,8 +68,8 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "nan": (lambda f: _write_ply(f, "0 0 nan|1 0 0|0 1 0", "3 0 1 2"), "vertex 0"),
     "face beyond the vertices": (lambda f: _write_ply(f, "0 0 0|1 0 0|0 1 0", "3 0 1 7"), "obj_000001.ply"),
     "no info": (lambda f: (f / "models_info.json").unlink(), "models_info.json: not found"),
-    "info is no json": (lambda f: (f / "models_info.json").write_text('{"1": '), "models_info.json: not a JSON"),
-    "info is a list": (lambda f: (f / "models_info.json").write_text("[1, 2]"), "models_info.json: not a JSON"),
+    "info is no json": (lambda f: (f / "models_info.json").write_text('{"1": '), "models_info.json: not valid JSON"),
+    "info is a list": (lambda f: (f / "models_info.json").write_text("[1, 2]"), "models_info.json: holds a JSON list"),
     "object without info": (lambda f: _edit_info(f, lambda i: i.pop("2")), "no entry for object 2"),
     "no diameter": (lambda f: _edit_info(f, lambda i: i["1"].pop("diameter")), "object 1 has diameter None"),
     "negative diameter": (lambda f: _edit_info(f, lambda i: i["1"].update(diameter=-3)), "diameter -3"),
@@ -79,7 +79,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "box is a mapping": (lambda f: _edit_info(f, lambda i: i["2"].update(size_z={})), "object 2 has size_z {}"),
     "box is text": (lambda f: _edit_info(f, lambda i: i["1"].update(size_x="30")), "object 1 has size_x '30'"),
     "box is not finite": (lambda f: _edit_info(f, lambda i: i["1"].update(size_x=float("nan"))), "size_x nan"),
-    "deep info": (lambda f: (f / "models_info.json").write_text("[" * 100_000), "models_info.json: not a JSON"),
+    "deep info": (lambda f: (f / "models_info.json").write_text("[" * 100_000), "is nested too deeply"),
     "metres": (lambda f: _edit_info(f, lambda i: i["1"].update(size_x=0.03)), "are its units millimetres"),
 }
 

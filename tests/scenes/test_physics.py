@@ -153,14 +153,14 @@ def test_the_same_release_settles_alike_whatever_came_before(shapes: list[Part])
     assert other != first
     assert settle(colliders, release(colliders, 1), SETTINGS) == first
     script = (
-        "import sys; sys.path.insert(0, 'tests')\n"
+        "import sys; sys.path.insert(0, 'tests/scenes')\n"
         "import test_physics as t, trimesh\n"
         "cube = t.part(trimesh.creation.box((0.06, 0.06, 0.06)))\n"
         "colliders = [item for _, item in t.shapes.__wrapped__(cube)]\n"
         "print('settled', t.settle(colliders, t.release(colliders, 1), t.SETTINGS))\n"
     )
     root = Path(__file__).resolve().parents[2]
-    environment = os.environ | {"PYTHONHASHSEED": "5", "PYTHONPATH": str(root)}
+    environment = os.environ | {"PYTHONHASHSEED": "5", "PYTHONPATH": str(root / "src")}
     done = subprocess.run(
         [sys.executable, "-c", script], check=False, capture_output=True, text=True, cwd=root, env=environment
     )
