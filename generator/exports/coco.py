@@ -28,14 +28,15 @@ from synthetless.io.files import atomic_file, read_json, remove_drafts
 BoxKind = Literal["visible", "amodal"]
 
 _OPEN = ConfigDict(extra="ignore", strict=True)
-_Side = Annotated[int, Field(ge=1)]
+_Side = Annotated[int, Field(ge=1, le=2**20)]
+_Run = Annotated[int, Field(ge=0, le=2**31)]
 
 
 @with_config(_OPEN)
 class _Segmentation(TypedDict):
     """Run lengths of a mask, plain or as pycocotools compresses them; ``size`` is [rows, columns]."""
 
-    counts: list[Count] | str
+    counts: list[_Run] | str
     size: Annotated[list[_Side], Field(min_length=2, max_length=2)]
 
 

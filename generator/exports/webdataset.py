@@ -90,6 +90,8 @@ def export_webdataset(
         raise UserError(f"images_per_shard is {images_per_shard}; 1 to {MAX_IMAGES_PER_SHARD} are possible")
     refuse_half_labelled(dataset)
     images = list(_images(dataset, split or find_split(dataset)))
+    if not images:
+        raise UserError(f"{dataset}: holds no images to export")
     if shuffle_seed is not None:
         order = np.random.default_rng(np.random.SeedSequence(shuffle_seed)).permutation(len(images))
         images = [images[i] for i in order]
