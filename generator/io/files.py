@@ -272,21 +272,45 @@ def in_turn(root: Path) -> Iterator[None]:
             continue
 
 
+def user_folder() -> Path:
+    """This user's own folder among the temporary files of this machine; what is in it may be deleted at any time.
+
+    Raises:
+        UserError: it cannot be made; or it is somebody else's, or open to others, who could put files of theirs there.
+    """
+    folder = Path(tempfile.gettempdir()) / f"synthetless-{os.getuid()}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be used ({error.strerror}); remove it, or set TMPDIR") from None
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise UserError(f"{folder}: must be a folder of yours with mode 0700, no link; remove it, or set TMPDIR")
+    return folder
+
+
 def claim(name: str) -> int:
     """Take the first number, counted from 0, that no other process of this user on this machine has taken.
 
     It is given back when this process ends, however that comes about.
+
+    Raises:
+        UserError: the user's folder among the temporary files cannot be used.
     """
-    folder = Path(tempfile.gettempdir()) / f"synthetless-{os.getuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
+    folder = user_folder()
     for number in count():
-        lock = os.open(folder / f"{name}-{number}.lock", os.O_CREAT | os.O_RDWR, 0o600)
+        path = folder / f"{name}-{number}.lock"
+        try:
+            lock = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o600)
+        except OSError as error:
+            raise UserError(f"{path}: cannot be written ({error.strerror})") from None
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the descriptor is open
-        except OSError:
-            os.close(lock)
-        else:
             return number
+        except BlockingIOError:
+            os.close(lock)
+        except OSError as error:
+            raise UserError(f"{path}: cannot be locked ({error.strerror}); set TMPDIR to another folder") from None
     raise AssertionError("there are always more numbers")
 
 
