@@ -473,7 +473,7 @@ def _rotations(labels: Sequence[CanonicalEntry]) -> NDArray[np.float64]:
     return np.array([label["cam_R_m2c_canonical"] for label in labels], dtype=np.float64).reshape(len(labels), 9)
 
 
-# What is told of it
+# Reports
 
 
 def _arrow(before: object, after: object) -> str:
@@ -531,7 +531,7 @@ def _refuse_foreign(root: Path, scenes: list[ScenePaths]) -> None:
     path = root / SYMMETRIES_FILE
     if path.exists():
         if not {"scheme", "objects"} <= read_json(path).keys() <= set(TABLE_KEYS):
-            raise UserError(f"{path}: is no symmetry table of synthetless and would be overwritten; move it away")
+            raise UserError(f"{path}: not a symmetry table of synthetless, and would be overwritten; move it away")
         return
     for scene in scenes:
         if scene.scene_gt_canonical.exists() and not is_half_labelled(root):

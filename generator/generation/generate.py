@@ -17,14 +17,14 @@ from synthetless.dataset import records
 from synthetless.dataset.layout import DATASET_FILE, FAILURES_FOLDER, SHEET_FILE, Part, by_drop, plan_image, scene_ids
 from synthetless.dataset.reader import read_recipe
 from synthetless.dataset.sheet import write_contact_sheet
-from synthetless.dataset.store import DatasetStore
+from synthetless.dataset.store import DatasetStore, make_folder
 from synthetless.errors import UserError
 from synthetless.generation import executors, ray_executor
 from synthetless.generation.devices import CPU, Devices
 from synthetless.generation.drop import DropRenderer
 from synthetless.generation.executors import DropResult, DropTask, WorkerConfig
 from synthetless.generation.sources import Sources, check_photos, load_sources
-from synthetless.io.files import in_turn, locked, write_json
+from synthetless.io.files import in_turn, locked, remove_file, write_json
 from synthetless.io.parallel import usable_cores
 from synthetless.scenes.sampling import sample_scene
 
@@ -95,17 +95,17 @@ def generate(recipe: Recipe, out: Path, execution: Execution) -> Summary:
     sources = load_sources(recipe)
     if not (out / DATASET_FILE).exists():
         check_photos(sources)
-    dataset = DatasetStore.open(out, recipe, sources.models, sources.scenery_digest)
+        make_folder(out)
     with locked(out, execution.part.name if execution.part else None):
+        with in_turn(out):  # parts that begin at the same moment must be parts of one recipe
+            dataset = DatasetStore.open(out, recipe, sources.models, sources.scenery_digest)
         missing = wanted(dataset, execution.part)
-        failures: list[DropResult] = []
+        failures = list[DropResult]()
         try:
             if missing:
                 failures = _make(dataset, sources, missing, execution)
         except BaseException:
-            with suppress(
-                UserError
-            ):  # an interrupted dataset can be looked at, too; the first error is the one to tell
+            with suppress(UserError):  # an interrupted dataset can be looked at, too; the first error is told
                 dataset.assemble()
             raise
         dataset.finish()
@@ -140,15 +140,15 @@ def retry(out: Path, drop: int, textures: str | None = None) -> int:
     if textures is not None:
         recipe = recipe.model_copy(update={"source": recipe.source.model_copy(update={"textures": textures})})
     sources = load_sources(recipe)
-    dataset = DatasetStore.open(out, recipe, sources.models, sources.scenery_digest)
-    views = recipe.camera.views_per_drop
-    plans = [plan_image(number, views) for number in range(drop * views, min((drop + 1) * views, recipe.images))]
-    if not plans:
-        raise UserError(f"{out}: has no drop {drop}; its {recipe.images} images show the drops from 0 on")
     with locked(out):
+        dataset = DatasetStore.open(out, recipe, sources.models, sources.scenery_digest)
+        views, images = recipe.camera.views_per_drop, dataset.recipe.images
+        plans = [plan_image(number, views) for number in range(drop * views, min((drop + 1) * views, images))]
+        if not plans:
+            raise UserError(f"{out}: has no drop {drop}; its {images} images show the drops from 0 on")
         for image in DropRenderer(recipe, sources).make(drop, plans):
             dataset.commit(image)
-        (out / FAILURES_FOLDER / f"{drop:08d}.json").unlink(missing_ok=True)
+        remove_file(_failure_note(out, drop))
         dataset.finish()
     return len(plans)
 
@@ -161,7 +161,7 @@ def _make(dataset: DatasetStore, sources: Sources, missing: list[int], execution
     interval = 0.5 if sys.stderr.isatty() else 60.0
     next_sheet: float = 1 if execution.preview_every else math.inf
     bar = tqdm(total=len(missing), unit="image", mininterval=interval, maxinterval=interval, smoothing=0.05)
-    with bar, closing(_results(dataset, tasks, execution)) as results:  # closed: no worker goes on after an error here
+    with bar, closing(_results(dataset, tasks, execution)) as results:  # closed: no worker continues after an error
         assembled = time.monotonic()
         for result in results:
             bar.update(result.made)
@@ -196,12 +196,16 @@ def _draw_sheet(dataset: DatasetStore) -> None:
 def _note_failure(dataset: DatasetStore, sources: Sources, result: DropResult) -> None:
     """Leave a note of a failed drop with the scene that it began with; take away that of one that went well."""
     drop, recipe = result.task.drop, dataset.recipe
-    path = dataset.root / FAILURES_FOLDER / f"{drop:08d}.json"
+    path = _failure_note(dataset.root, drop)
     if result.failure:
         scene = sample_scene(recipe, sources.catalogue, recipe.seed, drop)
         write_json(path, {"drop": drop, "failure": result.failure, "scene": asdict(scene)})
     else:
-        path.unlink(missing_ok=True)
+        remove_file(path)
+
+
+def _failure_note(root: Path, drop: int) -> Path:
+    return root / FAILURES_FOLDER / f"{drop:08d}.json"
 
 
 def _summarise(dataset: DatasetStore, made: int, failures: list[DropResult]) -> Summary:

@@ -11,12 +11,12 @@ import os
 import platform
 import re
 import sys
-import tempfile
 import time
 from collections import Counter, deque
 from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -28,7 +28,7 @@ from synthetless.generation.devices import CPU, ask, take_assigned
 from synthetless.generation.executors import FAULT_VARIABLE, DropResult, DropTask, DropWorker, WorkerConfig
 from synthetless.generation.sources import Sources, load_sources
 from synthetless.io.cache import CACHE_VARIABLE
-from synthetless.io.files import atomic_write
+from synthetless.io.files import atomic_write, user_folder
 from synthetless.scenes.blender import BlenderError
 
 Node = Mapping[str, Any]
@@ -37,10 +37,14 @@ Node = Mapping[str, Any]
 _TICK_S = 1.0
 _NODES_EVERY_S = 5.0
 """How often the list of nodes is read: those that join get workers, too."""
+_AHEAD = 10_000
+"""So many tasks are planned ahead, more than any cluster has workers, but not a million."""
 _PATIENCE_S = 60.0
 """After so long without any worker the user is told what is waited for."""
 _DEATHS = 2
-"""A drop over which so many workers died is given up; so is a cluster where so many die while they start."""
+"""A drop over which so many workers died is given up."""
+_DEATHS_AT_START = 5
+"""The run ends when so many workers have died while starting, one after the other, and none got through."""
 _LOST_NODES = 4
 """A node is lost through no fault of its drops; so many, one after the other, with the same drop are no accident."""
 _CONNECT_LIMIT_S = 30.0
@@ -200,7 +204,7 @@ def _with_photos(inputs: SharedInputs, photos: Mapping[str, bytes] | None) -> So
     if photos is None:
         return None
     # One for all workers of the node; it is named by its content, so that it may stay.
-    folder = Path(tempfile.gettempdir()) / f"synthetless-{os.getuid()}-{inputs.digest[:16]}"
+    folder = user_folder() / f"photos-{inputs.digest[:16]}"
     for name, content in photos.items():
         if not (folder / name).exists():
             atomic_write(folder / name, content)
@@ -245,8 +249,11 @@ class _RayPool:
 
     def work(self, tasks: Iterable[DropTask]) -> Iterator[DropResult]:
         """Do all the tasks; errors as in ``run``."""
-        self._waiting.extend(tasks)
-        while self._waiting or any(call.task for call in self._calls.values()):
+        source = iter(tasks)
+        while True:
+            self._waiting.extend(islice(source, max(0, _AHEAD - len(self._waiting))))
+            if not self._waiting and not any(call.task for call in self._calls.values()):
+                return
             self._start_workers()
             for ref in self._ray.wait(list(self._calls), timeout=_TICK_S)[0]:
                 result = self._receive(ref, self._calls.pop(ref))
@@ -334,8 +341,10 @@ class _RayPool:
         task, info = call.task, call.info
         if task is None or info is None:
             self._deaths_at_start += living >= call.nodes
-            if self._deaths_at_start >= _DEATHS:
-                raise BlenderError(f"workers of the Ray cluster die while they start ({_exit_of(death)})")
+            if self._deaths_at_start >= _DEATHS_AT_START:
+                raise BlenderError(
+                    f"{self._deaths_at_start} workers of the Ray cluster died while starting ({_exit_of(death)})"
+                )
             return None
         node_lost = info.node_id not in living
         self._deaths[task.drop, node_lost] += 1

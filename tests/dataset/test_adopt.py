@@ -258,7 +258,7 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "a foreign table": (
         lambda bop: (bop / "symmetries.json").write_text('{"1": "mine"}'),
-        r"symmetries\.json: is no symmetry table of synthetless",
+        r"symmetries\.json: not a symmetry table of synthetless",
     ),
     "a dataset of our own": (lambda bop: (bop / "dataset.json").write_text("{}"), "so use relabel"),
 }

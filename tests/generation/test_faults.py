@@ -28,7 +28,7 @@ camera: {{width: 64, height: 48, fx: 113, fy: 113, cx: 31.5, cy: 23.5, distance_
 objects: {{count: [1, 4]}}
 render: {{samples: 1}}
 """
-KILLS_OF_RUNS, KILLS_AT_START = 3, 10
+KILLS_OF_RUNS, KILLS_AT_START = 2, 10
 TOO_LITTLE_BYTES = 400 * 2**20
 """Address space in which Python starts, but not what a worker imports."""
 
@@ -98,7 +98,7 @@ def test_workers_and_runs_killed_again_and_again(recipe: Path, undisturbed: dict
 
 
 def test_workers_killed_while_they_start(recipe: Path, undisturbed: dict[str, bytes], tmp_path: Path) -> None:
-    """Each of the first ten workers, at any moment of its first two seconds: the run goes on without a word."""
+    """Each of the first ten workers, at any moment of its first two seconds: the run continues without a word."""
     out, chance = tmp_path / "d", random.Random(0)
     process = _start(recipe, out, "--workers", "2")
     lifetimes: dict[int, float] = {}
@@ -139,7 +139,7 @@ def test_workers_without_memory_end_the_run_with_one_line(
     assert "ends: " in line
     process = _start(recipe, out, "--workers", "2")
     _limit_memory(process, 3)
-    assert _ended(process) == (0, ""), "the others get their memory, and the run goes on"
+    assert _ended(process) == (0, ""), "the others get their memory, and the run continues"
     assert data_files(out) == undisturbed
 
 
