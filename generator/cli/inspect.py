@@ -14,7 +14,7 @@ from synthetless.doctor import examine, is_fit, to_json, to_text
 from synthetless.io.files import read_json
 from synthetless.preview import write_preview
 from synthetless.preview.pages import STATISTICS_FILE
-from synthetless.validation import validate
+from synthetless.validation import SAMPLE, validate
 
 
 def doctor_command(
@@ -49,7 +49,10 @@ def preview_command(
 
 def validate_command(
     dataset: Annotated[Path, typer.Argument(help="The dataset's folder.")],
-    deep: Annotated[bool, typer.Option("--deep", help="Also measure masks and depth of some images again.")] = False,
+    deep: Annotated[bool, typer.Option("--deep", help="Recompute every image, however many there are.")] = False,
+    sample: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Recompute so many images at most, evenly spread.")
+    ] = SAMPLE,
     exports: Annotated[
         list[Path] | None,
         typer.Option(
@@ -62,7 +65,7 @@ def validate_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Check every file, every label, and both against each other."""
-    found = validate(dataset, deep, exports or (), limit)
+    found = validate(dataset, None if deep else sample, exports or (), limit)
     print(json.dumps(found.to_json()) if as_json else "\n".join(found.lines()))
     if not found.valid:
         raise typer.Exit(EXIT_FAILED)

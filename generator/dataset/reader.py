@@ -13,13 +13,13 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from synthetless.annotation.instances import Box
 from synthetless.config import Recipe
@@ -38,6 +38,7 @@ from synthetless.dataset.records import (
     GtInfoEntry,
     ImageSpec,
     read_scene_json,
+    schema,
 )
 from synthetless.errors import UserError
 from synthetless.io import images
@@ -518,20 +519,13 @@ def read_specs(paths: ScenePaths) -> dict[int, ImageSpec]:
     """
     if not paths.scene_spec.exists():
         return {}
-    adapter = spec_schema()
     try:
-        specs = [adapter.validate_python(line) for line in read_json_lines(paths.scene_spec)]
+        specs = [schema(ImageSpec).validate_python(line) for line in read_json_lines(paths.scene_spec)]
     except ValidationError as error:
         fault = error.errors()[0]
         place = ".".join(str(part) for part in fault["loc"])
         raise UserError(f"{paths.scene_spec}: {place}: {fault['msg']}") from None
     return {spec.image_id: spec for spec in specs}
-
-
-@cache
-def spec_schema() -> TypeAdapter[ImageSpec]:
-    """The schema of a line of scene_spec.jsonl; made once, since that takes long."""
-    return TypeAdapter(ImageSpec)
 
 
 def read_recipe(root: Path) -> Recipe:
