@@ -50,7 +50,10 @@ def preview_command(
 
 def validate_command(
     dataset: Annotated[Path, typer.Argument(help="The dataset's folder.")],
-    deep: Annotated[bool, typer.Option("--deep", help="Also measure masks and depth of some images again.")] = False,
+    deep: Annotated[bool, typer.Option("--deep", help="Recompute every image, however many there are.")] = False,
+    sample: Annotated[
+        int | None, typer.Option(min=0, metavar="N", help="Recompute so many images at most, evenly spread.")
+    ] = None,
     exports: Annotated[
         list[Path] | None,
         typer.Option(
@@ -63,9 +66,10 @@ def validate_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Check every file, every label, and both against each other."""
-    from synthetless.validation import validate
+    from synthetless.validation import SAMPLE, validate
 
-    found = validate(dataset, deep, exports or (), limit)
+    wanted = SAMPLE if sample is None else sample
+    found = validate(dataset, None if deep else wanted, exports or (), limit)
     say(json.dumps(found.to_json()) if as_json else "\n".join(found.lines()))
     if not found.valid:
         raise typer.Exit(EXIT_FAILED)

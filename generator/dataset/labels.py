@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetless.dataset.layout import PENDING_FILE, SYMMETRIES_FILE
+from synthetless.dataset.layout import DATASET_FILE, PENDING_FILE, SYMMETRIES_FILE
 from synthetless.dataset.reader import ScenePoses, as_floats
 from synthetless.dataset.records import CameraEntry, CanonicalEntry, GtEntry, ModelInfo
 from synthetless.errors import UserError
+from synthetless.io.files import is_locked
 from synthetless.symmetry import CanonicalMap, CanonicalPoses, SymmetryTable
 
 Floats = NDArray[np.float64]
@@ -107,6 +109,38 @@ def refuse_half_labelled(root: Path) -> None:
     """
     if is_half_labelled(root):
         raise UserError(f"{root}: is half relabelled; run relabel (or adopt) again, which completes it")
+
+
+@contextmanager
+def undisturbed(root: Path) -> Iterator[None]:
+    """For those who only read a dataset: what they conclude from files that change meanwhile would be false.
+
+    Nothing is written, so that a dataset on a read-only disk can be read.
+
+    Raises:
+        UserError: another process writes the dataset, or has written it before the block ended.
+    """
+
+    def refuse() -> None:
+        if is_locked(root) or _state(root) != before:
+            raise UserError(
+                f"{root}: another synthetless is writing here, or was meanwhile; wait for it, then try again"
+            )
+
+    before = _state(root)
+    refuse()
+    try:
+        yield
+    except UserError:
+        refuse()
+        raise
+    refuse()
+
+
+def _state(root: Path) -> list[tuple[int, int]]:
+    """What becomes different whenever a dataset is changed."""
+    paths = [root / name for name in (DATASET_FILE, SYMMETRIES_FILE, PENDING_FILE)]
+    return [(status.st_ino, status.st_mtime_ns) for path in paths if path.exists() for status in [path.stat()]]
 
 
 def box_corners_mm(info: ModelInfo) -> Floats:

@@ -239,6 +239,13 @@ def _without_links(path: Path) -> Path:
         raise UserError(f"{path}: cannot be followed ({error})") from None
 
 
+def other_sensors(folder: Path) -> list[str]:
+    """Ground truth of further sensors in a scene folder, such as scene_gt_cam1.json: BOP 2024 allows several."""
+    own = {"scene_gt_info.json", "scene_gt_coco.json", "scene_gt_canonical.json"}
+    names = sorted(path.name for path in folder.glob("scene_gt_*.json") if path.name not in own)
+    return [name for name in names if not name.startswith(("scene_gt_info_", "scene_gt_coco_"))]
+
+
 def find_models_folder(root: Path) -> Path:
     """The folder with the models_info.json of a BOP dataset.
 

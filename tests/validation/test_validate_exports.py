@@ -42,7 +42,7 @@ def test_exports_as_written_are_right(valid: Path, shards: Path, tmp_path: Path)
         kind: BoxKind = "visible" if boxes == "visible" else "amodal"
         export_coco(valid, exports[-1], boxes=kind)
     report = validate(valid, exports=exports, workers=1)
-    assert report.lines() == [f"{valid}: 6 images, 34 instances, 3 exports: valid"]
+    assert report.lines() == [f"{valid}: 6 images, 6 of them recomputed, 34 instances, 3 exports: valid"]
 
 
 def test_workers_compare_shards_alike(valid: Path, shards: Path, tmp_path: Path) -> None:
