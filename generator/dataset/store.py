@@ -285,7 +285,7 @@ class DatasetStore:
         folder = self.root / MODELS_FOLDER
         for model in models.values():
             if not (folder / model.path.name).exists():
-                atomic_write(folder / model.path.name, model.path.read_bytes())
+                atomic_write(folder / model.path.name, model.to_ply())
         infos = {str(obj_id): dict(model.info) for obj_id, model in models.items()}
         camera = records.camera_json(self.recipe.intrinsics, self.recipe.encoding.depth_scale)
         for path, content in ((folder / INFO_FILE, infos), (self.root / CAMERA_FILE, camera)):
