@@ -1,4 +1,4 @@
-"""Renders a recorded image again, from nothing but what the dataset says of it."""
+"""Renders a recorded image again, from its record alone."""
 
 from __future__ import annotations
 
