@@ -5,15 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)  # Rec. 709
+from synthetless.scenes.color import LUMINANCE, srgb
+from synthetless.scenes.sensor import expose
+from synthetless.scenes.spec import SensorSpec
+
 _GAIN_STEPS = 24
-
-
-def srgb(linear: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Displayed value of linear light, both clipped to 0..1 (IEC 61966-2-1)."""
-    value = np.clip(linear, 0.0, 1.0)
-    displayed: NDArray[np.float32] = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
-    return displayed
 
 
 def exposure_gain(linear: NDArray[np.float32], bounds: tuple[float, float]) -> float:
@@ -26,7 +22,7 @@ def exposure_gain(linear: NDArray[np.float32], bounds: tuple[float, float]) -> f
     Returns:
         1 where the image is within bounds as it is, or where it is black.
     """
-    luminance = np.maximum(linear @ _LUMINANCE, 0.0)
+    luminance = np.maximum(linear @ LUMINANCE, 0.0)
     mean = float(srgb(luminance).mean())
     target = min(max(mean, bounds[0]), bounds[1])
     if mean in (target, 0.0):
@@ -45,3 +41,8 @@ def tonemap(linear: NDArray[np.float32], gain: float) -> NDArray[np.uint8]:
     """(H, W, 3) linear light, times a gain, as 8-bit sRGB."""
     displayed: NDArray[np.uint8] = np.rint(srgb(linear * np.float32(gain)) * 255).astype(np.uint8)
     return displayed
+
+
+def picture(linear: NDArray[np.float32], gain: float, sensor: SensorSpec | None) -> NDArray[np.uint8]:
+    """The image that is stored: as a camera takes it, or, without one, the plain tone mapping."""
+    return tonemap(linear, gain) if sensor is None else expose(linear, sensor, gain)

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from synthetless.dataset.records import CameraEntry, ImageSpec
-from synthetless.io.color import srgb
-from synthetless.scenes.spec import Material, PlaneSpec, Vector, View
+from synthetless.scenes.color import srgb
+from synthetless.scenes.spec import Material, PlaneSpec, SensorSpec, Vector, View
 from synthetless.scenes.textures import PhotoTexture
 
 Section = dict[str, Any]
@@ -46,6 +46,7 @@ def sections(camera: CameraEntry, recorded: ImageSpec | None) -> list[Section]:
                 ["objects dropped", str(len(spec.objects))],
             ],
         },
+        *([] if recorded.sensor is None else [{"title": "Sensor", "rows": _sensor(recorded.sensor)}]),
     ]
 
 
@@ -64,6 +65,21 @@ def _view(view: View) -> list[list[str]]:
         ["elevation", f"{view.elevation_deg:.1f}°"],
         ["azimuth", f"{view.azimuth_deg:.1f}°"],
         ["roll", f"{view.roll_deg:.1f}°"],
+    ]
+
+
+def _sensor(sensor: SensorSpec) -> list[list[str]]:
+    return [
+        ["point spread", f"{sensor.blur_px:.2f} px"],
+        ["vignetting", f"{sensor.vignetting:.2f}"],
+        ["over-exposure", f"{sensor.exposure_ev:+.2f} stops"],
+        ["highlight shoulder", f"{sensor.shoulder:.2f}"],
+        ["photons at full scale", f"{sensor.photons:.0f}"],
+        ["read noise", f"{sensor.read_noise:.4f}"],
+        ["white balance", f"red {sensor.red_gain:.2f}, blue {sensor.blue_gain:.2f}"],
+        ["chroma smoothing", f"{sensor.chroma_px:.2f} px"],
+        ["sharpening", f"{sensor.sharpen:.2f} at {sensor.sharpen_px:.2f} px"],
+        ["JPEG inside the camera", "none" if sensor.jpeg_quality is None else f"quality {sensor.jpeg_quality}"],
     ]
 
 

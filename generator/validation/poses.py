@@ -9,6 +9,7 @@ import numpy as np
 from synthetless.annotation.instances import image_window
 from synthetless.dataset.layout import ImagePlan
 from synthetless.dataset.records import Entry, ImageSpec, camera_matrix
+from synthetless.dataset.store import planned_sensor
 from synthetless.scenes.camera import extrinsics, settled_centre
 from synthetless.validation.geometry import (
     ROTATION_TOLERANCE,
@@ -86,7 +87,7 @@ def check_specs(
     by_image = {plan.im_id: plan for plan in plans}
     for im_id, recorded in labels.spec.items():
         if im_id in by_image:
-            yield from _check_plan(labels, recorded, by_image[im_id])
+            yield from _check_plan(source, labels, recorded, by_image[im_id])
         if im_id in labels.camera and im_id in labels.gt:
             fault = incoherence(recorded, len(labels.gt[im_id]))
             if fault:
@@ -97,7 +98,7 @@ def check_specs(
                 yield from _check_unlabelled(source, labels, recorded)
 
 
-def _check_plan(labels: SceneLabels, recorded: ImageSpec, plan: ImagePlan) -> Iterator[Finding]:
+def _check_plan(source: Source, labels: SceneLabels, recorded: ImageSpec, plan: ImagePlan) -> Iterator[Finding]:
     found, expected = (recorded.scene.drop, recorded.view), (plan.drop, plan.view)
     if found != expected:
         yield Finding(
@@ -106,6 +107,9 @@ def _check_plan(labels: SceneLabels, recorded: ImageSpec, plan: ImagePlan) -> It
             f"shows drop {found[0]}, view {found[1]}; this image is of drop {expected[0]}, view {expected[1]}",
             plan.im_id,
         )
+    if recorded.sensor != planned_sensor(source.recipe, plan):
+        message = "records another sensor than the recipe draws for this image"
+        yield Finding("spec", labels.paths.scene_spec, message, plan.im_id)
 
 
 def incoherence(recorded: ImageSpec, n_labelled: int) -> str | None:

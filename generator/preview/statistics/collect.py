@@ -15,8 +15,8 @@ from synthetless.dataset.layout import ScenePaths, scene_ids
 from synthetless.dataset.reader import ImageEntries, read_entries, read_specs
 from synthetless.dataset.records import ImageSpec
 from synthetless.io import images
-from synthetless.io.color import srgb
 from synthetless.io.files import read_bytes
+from synthetless.scenes.color import srgb
 from synthetless.scenes.spec import SceneSpec, View
 
 Floats = NDArray[np.float64]
