@@ -14,7 +14,8 @@ FOLDERS = {"generator": "synthetless", "scenes": "synthetless.scenes", "assets":
 FLOORS = (
     {"errors", "assets"},
     {"scenes"},
-    {"io", "config"},
+    {"io"},
+    {"config"},
     {"annotation"},
     {"symmetry"},
     {"dataset"},

@@ -154,7 +154,7 @@ class DatasetStore:
             _refuse_other(known, {**read_json(known), "recipe": dump_recipe(begun_with)}, header)
             recipe = recipe.model_copy(update={"images": max(recipe.images, begun_with.images)})
         else:
-            _refuse_foreign(root)
+            make_folder(root)
             write_json(known, header)
         dataset = cls(root, recipe)
         dataset._write_companions(models)
@@ -350,7 +350,12 @@ def versions() -> dict[str, str]:
     return {name: version(name) for name in ("synthetless", "bpy")}
 
 
-def _refuse_foreign(root: Path) -> None:
+def make_folder(root: Path) -> None:
+    """Make the folder of a dataset that is to be begun.
+
+    Raises:
+        DatasetError: it cannot be made, or holds files of something else.
+    """
     try:
         root.mkdir(parents=True, exist_ok=True)
         strangers = sorted(path.name for path in root.iterdir() if not path.name.startswith("."))
