@@ -45,7 +45,7 @@ def capture(
     Args:
         linear: as for ``expose``.
         settings: the ranges.
-        rng: decides everything random; it advances by the same amount whatever the settings are.
+        rng: everything random follows from it.
         gain, corner_px, frame_px: as for ``expose``.
     """
     return expose(linear, draw_sensor(settings, rng), gain, corner_px, frame_px)
