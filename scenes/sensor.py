@@ -20,10 +20,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetless.scenes.color import LUMINANCE, srgb
 from synthetless.scenes.sampling import draw_sensor
 from synthetless.scenes.settings import SensorSettings
 from synthetless.scenes.spec import SensorSpec
+from synthetless.scenes.srgb import LUMINANCE_WEIGHTS, srgb_from_linear
 
 Light = NDArray[np.float32]
 
@@ -76,7 +76,7 @@ def expose(
     light *= _falloff(light.shape, drawn.vignetting, corner_px, frame_px) * (gain * 2.0**drawn.exposure_ev)
     rgb = demosaicked(_photographed(_rolled_off(light, drawn.shoulder), drawn))
     rgb *= np.array([drawn.red_gain, 1.0, drawn.blue_gain], dtype=np.float32)
-    displayed = srgb(_chroma_smoothed(rgb, drawn.chroma_px))
+    displayed = srgb_from_linear(_chroma_smoothed(rgb, drawn.chroma_px))
     levels = np.rint(255 * np.clip(_sharpened(displayed, drawn.sharpen, drawn.sharpen_px), 0, 1)).astype(np.uint8)
     return levels if drawn.jpeg_quality is None else _through_jpeg(levels, drawn.jpeg_quality)
 
@@ -191,7 +191,7 @@ def _chroma_smoothed(rgb: Light, sigma_px: float) -> Light:
     """Colour differences from the luminance, blurred; the luminance stays as sharp as it is."""
     if sigma_px == 0:
         return rgb
-    luminance: Light = (rgb @ LUMINANCE)[..., None]
+    luminance: Light = (rgb @ LUMINANCE_WEIGHTS)[..., None]
     return luminance + blurred(rgb - luminance, sigma_px)
 
 
@@ -199,7 +199,7 @@ def _sharpened(displayed: Light, amount: float, sigma_px: float) -> Light:
     """Unsharp masking of the luminance, as cameras do it, on displayed values."""
     if amount == 0:
         return displayed
-    luminance = displayed @ LUMINANCE
+    luminance = displayed @ LUMINANCE_WEIGHTS
     sharp: Light = displayed + amount * (luminance - blurred(luminance, sigma_px))[..., None]
     return sharp
 
