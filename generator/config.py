@@ -168,6 +168,9 @@ def _apply(tree: dict[str, Any], override: str) -> None:
         value = parse_document(text, shown(text))
     except UserError as error:
         raise RecipeError(f"--set {key}: {error}") from None
+    named = tree.get("sensor")
+    if path[0] == "sensor" and len(path) > 1 and (named is None or isinstance(named, str)):
+        tree["sensor"] = {} if named in (None, "none") else {"preset": named}
     node = tree
     for name in path[:-1]:
         child = node.setdefault(name, {})

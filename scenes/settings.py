@@ -137,6 +137,9 @@ class TableSettings(Settings):
     """Side of the square table."""
     tile_m: Annotated[FloatRange, Bounds(0.01, 10, "m")] = (0.25, 1.0)
     """Side of one texture tile, drawn log-uniformly."""
+    photos: Literal["mirrored", "seamless"] = "mirrored"
+    """How photographs are repeated: mirrored at their borders; or seamless, opposite borders joined along the path on
+    which they differ least, in tiles so small, down to the least of tile_m, that a texel is not larger than a pixel."""
     roughness: Annotated[FloatRange, Bounds(0, 1)] = (0.4, 1.0)
     """Surface roughness of the table."""
     specular: Annotated[FloatRange, Bounds(0, 1)] = (0.0, 0.0)

@@ -44,7 +44,7 @@ def render_again(dataset: Path, scene_id: int, im_id: int, textures: Path | None
     if textures is None and recipe.source.textures != BUILTIN:
         textures = Path(recipe.source.textures)
     session = BlenderSession(
-        _meshes(dataset, recipe, image.scene), recipe.intrinsics, recipe.render, recipe.table.size_m, textures
+        _meshes(dataset, recipe, image.scene), recipe.intrinsics, recipe.render, recipe.table, textures
     )
     with session.scene(image.scene, image.settled) as scene:
         return picture(scene.render(image.view), image.exposure_gain, image.sensor)

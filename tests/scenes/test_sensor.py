@@ -368,6 +368,8 @@ def test_a_preset_sets_what_is_not_given_and_is_written_out() -> None:
     assert mixed is not None
     assert mixed.photons == (500, 600)
     assert mixed.model_copy(update={"photons": camera.sensor.photons}) == camera.sensor
+    assert load_recipe(None, ["sensor=primesense", "sensor.photons=[500, 600]"]).sensor == mixed
+    assert load_recipe(None, ["sensor=none", "sensor.variant=2"]) == load_recipe(None, ["sensor.variant=2"])
 
 
 @pytest.mark.parametrize(
