@@ -166,6 +166,10 @@ class Image:
         path = self.paths.find_rgb(self.im_id) or self.paths.rgb(self.im_id)
         return images.decode_rgb(read_bytes(path), path)
 
+    def linear(self) -> NDArray[np.float32]:
+        """(H, W, 3) linear light before exposure, Rec. 709 primaries, if ``outputs`` has exr."""
+        return images.read_exr(self.paths.exr(self.im_id))
+
     def depth_mm(self) -> Floats:
         """(H, W) z in millimetres, 0 where there is no depth."""
         path = self.paths.depth(self.im_id)

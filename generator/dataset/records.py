@@ -8,7 +8,7 @@ https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, NotRequired
@@ -23,7 +23,7 @@ from synthetless.annotation.instances import InstanceAnnotation
 from synthetless.errors import UserError
 from synthetless.io.documents import shown
 from synthetless.io.files import read_json, write_json
-from synthetless.scenes.spec import Intrinsics, Pose, SceneSpec
+from synthetless.scenes.spec import Intrinsics, Pose, SceneSpec, SensorSpec
 
 MIN_VISIB_FRACT = 0.1
 """Instances with a smaller visible fraction are marked ``ignore`` in scene_gt_coco.json, as bop_toolkit does."""
@@ -207,6 +207,7 @@ class ImageSpec:
         instances: number in ``scene.objects`` of each labelled instance, in scene_gt's order.
         scene: what was built.
         settled: pose of each object at rest.
+        sensor: the camera that took the picture; without one, the record leaves it out.
     """
 
     image_id: int
@@ -215,6 +216,7 @@ class ImageSpec:
     instances: tuple[int, ...]
     scene: SceneSpec
     settled: tuple[Pose, ...]
+    sensor: SensorSpec | None = None
 
 
 class ImageRecord(TypedDict):
@@ -275,6 +277,14 @@ def _schema_fault(fault: ErrorDetails) -> SchemaFault:
     if fault["type"] == "missing":
         return SchemaFault(fault["loc"], f"{name} is missing")
     return SchemaFault(fault["loc"], f"{name} is {shown(fault['input'])}: {fault['msg'][0].lower()}{fault['msg'][1:]}")
+
+
+def spec_entry(spec: ImageSpec) -> dict[str, Any]:
+    """An image's line in scene_spec.jsonl."""
+    entry = asdict(spec)
+    if spec.sensor is None:
+        del entry["sensor"]
+    return entry
 
 
 def write_scene_json(path: Path, entries: Mapping[int, Any]) -> None:

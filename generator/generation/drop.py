@@ -68,7 +68,7 @@ class DropRenderer:
             self._meshes,
             recipe.intrinsics,
             recipe.render,
-            recipe.table.size_m,
+            recipe.table,
             sources.photos_folder,
             threads,
             device,
