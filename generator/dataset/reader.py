@@ -442,7 +442,7 @@ class Dataset(Sequence[Image]):
             split: may be left out where there is only one.
 
         Raises:
-            UserError: this is no BOP dataset, the split is not in it, or there are several and none is named.
+            UserError: this is not a BOP dataset, the split is not in it, or there are several and none is named.
         """
         root = Path(root)
         split = split or find_split(root)

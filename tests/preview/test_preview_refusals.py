@@ -94,7 +94,7 @@ def test_what_is_no_preview_is_kept(small_dataset: Path, tmp_path: Path, kind: s
         to.mkdir()
         (to / ("index.html" if "page" in kind else "letter")).write_text("mine")
     before = contents(tmp_path)
-    with pytest.raises(UserError, match="is no preview"):
+    with pytest.raises(UserError, match="is not a preview"):
         write_preview(small_dataset, to, limit=1)
     assert contents(tmp_path) == before
 
