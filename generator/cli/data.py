@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from synthetless.cli.options import Split
+from synthetless.dataset.labels import undisturbed
 from synthetless.exports.coco import export_coco
 from synthetless.exports.webdataset import export_webdataset, relabel_webdataset
 from synthetless.fetch import fetch
@@ -44,7 +45,9 @@ def coco_command(
 
     Canonical poses, and box corners as keypoints, are in it.
     """
-    print(f"{export_coco(dataset, to, split, boxes)} images in {to}")
+    with undisturbed(dataset, may_grow=True):
+        count = export_coco(dataset, to, split, boxes)
+    print(f"{count} images in {to}")
 
 
 def webdataset_command(
@@ -59,9 +62,10 @@ def webdataset_command(
 
     The labels are in .gt_canonical.json.
     """
-    if relabel_only:
-        relabel_webdataset(dataset, to, split)
-        print(f"labels renewed in {to}")
-        return
-    shards = export_webdataset(dataset, to, split, images_per_shard, shuffle_seed)
+    with undisturbed(dataset, may_grow=True):
+        if relabel_only:
+            relabel_webdataset(dataset, to, split)
+            print(f"labels renewed in {to}")
+            return
+        shards = export_webdataset(dataset, to, split, images_per_shard, shuffle_seed)
     print(f"{len(shards)} images in {len(set(shards.values()))} shards in {to}")

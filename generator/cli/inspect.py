@@ -10,6 +10,7 @@ import typer
 
 from synthetless.cli.generate import EXIT_FAILED
 from synthetless.cli.options import Split, Workers
+from synthetless.dataset.labels import undisturbed
 from synthetless.doctor import examine, is_fit, to_json, to_text
 from synthetless.io.files import read_json
 from synthetless.preview import write_preview
@@ -42,7 +43,8 @@ def preview_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print the statistics as JSON.")] = False,
 ) -> None:
     """Make a gallery and statistics for the browser."""
-    page = write_preview(dataset, to, split, images, workers)
+    with undisturbed(dataset, may_grow=True):
+        page = write_preview(dataset, to, split, images, workers)
     statistics = read_json(page.parent / STATISTICS_FILE)
     print(json.dumps({"page": str(page), "statistics": statistics}) if as_json else f"preview: {page}")
 
