@@ -206,6 +206,13 @@ def scene_folders(root: Path, having: Iterable[str]) -> list[ScenePaths]:
     return [ScenePaths(folder) for folder in sorted(folders) if folder.name.isdecimal()]
 
 
+def other_sensors(folder: Path) -> list[str]:
+    """Ground truth of further sensors in a scene folder, such as scene_gt_cam1.json: BOP 2024 allows several."""
+    own = {"scene_gt_info.json", "scene_gt_coco.json", "scene_gt_canonical.json"}
+    names = sorted(path.name for path in folder.glob("scene_gt_*.json") if path.name not in own)
+    return [name for name in names if not name.startswith(("scene_gt_info_", "scene_gt_coco_"))]
+
+
 def refuse_target(root: Path, to: Path, own: str | None = None) -> None:
     """Keep an answer about a dataset from taking the place of what the dataset consists of.
 
