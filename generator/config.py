@@ -21,6 +21,9 @@ from synthetless.scenes.settings import SENSORS, Bounds, SceneSettings, SensorSe
 from synthetless.scenes.spec import Intrinsics
 
 BUILTIN = "builtin"
+SPLIT = "train_synthetless"
+"""The folder of scenes, if a recipe names no other."""
+
 Output = Literal["rgb", "depth", "masks", "normals", "object_coordinates", "exr"]
 
 
@@ -70,7 +73,7 @@ class Recipe(SceneSettings):
 
     name: str = "synthetless"
     """Name of the dataset, recorded with it."""
-    split: Annotated[str, Field(pattern=r"^[A-Za-z0-9_]+$")] = "train_synthetless"
+    split: Annotated[str, Field(pattern=r"^[A-Za-z0-9_]+$")] = SPLIT
     """Name of the split's folder."""
     images: Annotated[int, Bounds(1, 100_000_000, "images")] = 30000
     """How many images to make."""

@@ -13,6 +13,7 @@ from typer.core import TyperCommand
 
 from synthetless.cli.options import Workers
 from synthetless.cli.terminal import EXIT_FAILED, EXIT_INTERRUPTED, leave, say
+from synthetless.errors import UserError
 from synthetless.scenes.blender import Kind
 
 if TYPE_CHECKING:
@@ -180,10 +181,14 @@ def render_command(
     ] = None,
 ) -> None:
     """Render one recorded image again."""
+    from synthetless.dataset.layout import refuse_target
     from synthetless.generation.rerender import render_again
     from synthetless.io.files import atomic_write
     from synthetless.io.images import encode_png
 
+    refuse_target(dataset, to)
+    if to.exists():
+        raise UserError(f"{to}: exists already; give a new name")
     atomic_write(to, encode_png(render_again(dataset, scene, image, textures)))
     say(to)
 

@@ -112,35 +112,39 @@ def refuse_half_labelled(root: Path) -> None:
 
 
 @contextmanager
-def undisturbed(root: Path) -> Iterator[None]:
+def undisturbed(root: Path, may_grow: bool = False) -> Iterator[None]:
     """For those who only read a dataset: what they conclude from files that change meanwhile would be false.
 
     Nothing is written, so that a dataset on a read-only disk can be read.
 
+    Args:
+        root: the dataset's folder.
+        may_grow: whether new images may be added meanwhile; those who read assembled files do not notice.
+
     Raises:
         UserError: another process writes the dataset, or has written it before the block ended.
     """
+    before = _stamps(root)
 
-    def refuse() -> None:
-        if is_locked(root) or _state(root) != before:
-            raise UserError(
-                f"{root}: another synthetless is writing here, or was meanwhile; wait for it, then try again"
-            )
+    def refuse(strictly: bool) -> None:
+        now = _stamps(root)
+        if now[1:] != before[1:] or (strictly and (is_locked(root) or now != before)):
+            raise UserError(f"{root}: another synthetless is writing here, or was meanwhile; try again when it is done")
 
-    before = _state(root)
-    refuse()
+    refuse(not may_grow)
     try:
         yield
     except UserError:
-        refuse()
+        refuse(strictly=True)
         raise
-    refuse()
+    refuse(not may_grow)
 
 
-def _state(root: Path) -> list[tuple[int, int]]:
-    """What becomes different whenever a dataset is changed."""
+def _stamps(root: Path) -> list[tuple[int, int] | None]:
+    """What becomes different when dataset.json is written anew; and, behind the first, when labels are."""
     paths = [root / name for name in (DATASET_FILE, SYMMETRIES_FILE, PENDING_FILE)]
-    return [(status.st_ino, status.st_mtime_ns) for path in paths if path.exists() for status in [path.stat()]]
+    found = [path.stat() if path.exists() else None for path in paths]
+    return [None if status is None else (status.st_ino, status.st_mtime_ns) for status in found]
 
 
 def box_corners_mm(info: ModelInfo) -> Floats:

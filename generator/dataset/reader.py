@@ -446,7 +446,7 @@ class Dataset(Sequence[Image]):
             split: may be left out where there is only one.
 
         Raises:
-            UserError: this is no BOP dataset, the split is not in it, or there are several and none is named.
+            UserError: this is not a BOP dataset, the split is not in it, or there are several and none is named.
         """
         root = Path(root)
         split = split or find_split(root)
@@ -581,9 +581,8 @@ def read_specs(paths: ScenePaths) -> dict[int, ImageSpec]:
     """
     if not paths.scene_spec.exists():
         return {}
-    specs: list[ImageSpec] = [
-        validated(ImageSpec, line, paths.scene_spec) for line in read_json_lines(paths.scene_spec)
-    ]
+    lines = read_json_lines(paths.scene_spec)
+    specs: list[ImageSpec] = [validated(ImageSpec, line, paths.scene_spec) for line in lines]
     return {spec.image_id: spec for spec in specs}
 
 

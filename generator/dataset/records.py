@@ -260,14 +260,14 @@ def schema_faults(form: Any, value: Any) -> list[SchemaFault]:
     return []
 
 
-def validated(form: Any, content: Any, path: Path) -> Any:
-    """The content of a file, held against the schema of a type.
+def validated(form: Any, value: Any, path: Path) -> Any:
+    """A parsed JSON value as a type of this module.
 
     Raises:
-        UserError: it is otherwise; with the file, the place in it, and what was expected.
+        UserError: it departs from the schema; with the file, the first place in it, and what was expected.
     """
     try:
-        return schema(form).validate_python(content)
+        return schema(form).validate_python(value)
     except ValidationError as error:
         raise UserError(f"{path}: {_schema_fault(error.errors(include_url=False)[0]).message}") from None
 

@@ -184,7 +184,7 @@ def _refuse_others(to: Path) -> None:
         with to.open("rb") as file:
             if _BEGINNING.match(file.read(4096)):
                 return
-    raise UserError(f"{to}: exists already and is no COCO export; give a new name")
+    raise UserError(f"{to}: exists already and is not a COCO export; give a new name")
 
 
 def _by_image(

@@ -42,6 +42,10 @@ _QUICK_TO_READ = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.
 _DEFLATE = (cv2.IMWRITE_PNG_COMPRESSION, 3)
 
 
+class DamagedImageError(UserError):
+    """A file that cannot be decoded: cut off, damaged, or no image at all."""
+
+
 def max_depth_mm(depth_scale: float) -> float:
     """The largest depth that a 16-bit depth image can hold, 6553.5 mm for the scale 0.1."""
     return _UINT16_MAX * depth_scale
@@ -191,7 +195,7 @@ def _encode(extension: str, image: NDArray[Any], parameters: Sequence[int]) -> b
 def _decode(data: bytes, name: str | Path, dtype: type[np.generic], channels: int) -> NDArray[Any]:
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if image is None:
-        raise UserError(f"{name}: not a readable image of {len(data)} bytes, cut off or damaged")
+        raise DamagedImageError(f"{name}: not a readable image of {len(data)} bytes, cut off or damaged")
     found = 1 if image.ndim == 2 else image.shape[2]
     if image.dtype != dtype or found != channels:
         bits, expected = 8 * image.dtype.itemsize, 8 * np.dtype(dtype).itemsize

@@ -1,4 +1,4 @@
-"""One image for the pages: its small pictures, and everything that can be drawn into them or told beside them.
+"""One image for the pages: its small pictures, and everything that is drawn into them or listed beside them.
 
 What is drawn is data, as outlines and lines in pixels of the image; pixel (i, j) has its centre at (u, v) = (i, j).
 """

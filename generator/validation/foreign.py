@@ -20,22 +20,24 @@ from synthetless.dataset.layout import (
     SYMMETRIES_FILE,
     ScenePaths,
     find_models_folder,
+    other_sensors,
     scene_folders,
 )
 from synthetless.dataset.records import (
+    CameraEntry,
     CanonicalEntry,
     ForeignCameraEntry,
     ForeignGtEntry,
     ForeignGtInfoEntry,
     ModelInfo,
+    read_scene_json,
 )
 from synthetless.io.files import read_bytes
-from synthetless.io.images import decode_depth, decode_mask, decode_rgb
+from synthetless.io.images import DamagedImageError, decode_depth, decode_mask, decode_rgb
 from synthetless.io.models import INFO_FILE
 from synthetless.symmetry.quaternions import MAX_DEFECT
 from synthetless.validation.images import (
     AS_RENDERED,
-    CutError,
     InstanceMasks,
     Mask,
     Pictures,
@@ -139,7 +141,7 @@ def check_foreign_scene(task: ForeignTask) -> ForeignResult:
         tally.add([Finding("stale", paths.scene_gt_canonical, message)])
     files = SceneFiles.list(scene)
     tally.add(files.check_folders(scene))
-    for im_id in sorted(scene.gt.keys() | {im_id for _, im_id in files.pictures}):
+    for im_id in sorted(scene.gt.keys() | files.image_ids):
         tally.add(_check_image(scene, files, im_id))
     instances = sum(len(gt) for gt in scene.gt.values())
     return ForeignResult(tally, len(scene.gt), instances, files.unchecked)
@@ -156,6 +158,8 @@ def notes_on(foreign: Foreign, results: Sequence[ForeignResult]) -> Iterator[str
         f"no {DATASET_FILE}: taken for a dataset that others made and adopt labelled. Not checked: models, depth "
         "against poses, what only a recipe and records tell" + ", ".join(["", *names[:_NAMES_SHOWN]]) + more
     )
+    if sensors := {name for scene in foreign.scenes for name in other_sensors(scene.root)}:
+        yield f"several sensors in one scene folder ({', '.join(sorted(sensors))}) are not supported, and not checked"
     if foreign.infos is None:
         yield f"labels were not recomputed: no {INFO_FILE} inside the dataset"
     for what in (("scene_gt_info.json",), ("mask",), ("mask_visib",), ("depth",), ("rgb", "gray")):
@@ -169,10 +173,9 @@ def notes_on(foreign: Foreign, results: Sequence[ForeignResult]) -> Iterator[str
 
 def _read_records(paths: ScenePaths) -> SceneRecords:
     findings: list[Finding] = []
-    camera = read_entries(paths.scene_camera, ForeignCameraEntry, findings)
     return SceneRecords(
         paths,
-        camera=camera,
+        camera=_read_cameras(paths.scene_camera, findings),
         gt=read_entries(paths.scene_gt, list[ForeignGtEntry], findings),
         gt_info=read_entries(paths.scene_gt_info, list[ForeignGtInfoEntry], findings)
         if paths.scene_gt_info.exists()
@@ -180,6 +183,19 @@ def _read_records(paths: ScenePaths) -> SceneRecords:
         canonical=read_entries(paths.scene_gt_canonical, list[CanonicalEntry], findings),
         findings=findings,
     )
+
+
+def _read_cameras(path: Path, findings: list[Finding]) -> dict[int, CameraEntry]:
+    faults: list[Finding] = []
+    cameras = read_entries(path, ForeignCameraEntry, faults)
+    lacking = [finding.image for finding in faults if finding.image is not None and finding.message.startswith("cam_K")]
+    content = read_scene_json(path) if lacking else {}
+    modelled = {im_id for im_id in lacking if isinstance(content[im_id], dict) and "cam_model" in content[im_id]}
+    if modelled:
+        what = f"{len(modelled)} images have cam_model instead of cam_K, as BOP has it since 2024"
+        findings.append(Finding("schema", path, f"{what}; only pinhole cameras are supported"))
+    findings += [finding for finding in faults if finding.image not in modelled]
+    return cameras
 
 
 def _check_agreement(scene: SceneRecords) -> Iterator[Finding]:
@@ -245,6 +261,15 @@ class SceneFiles:
         shape = max(sizes, key=sizes.__getitem__) if sizes else None
         return cls(pictures, masks, shape, frozenset(unchecked))
 
+    @property
+    def image_ids(self) -> set[int]:
+        """Images that have a file."""
+        return {im_id for _, im_id in self.pictures} | {im_id for _, (im_id, _) in self.masks}
+
+    def n_instances(self, im_id: int) -> int:
+        """Of how many instances of an image there may be masks."""
+        return 1 + max((gt_id for _, (of, gt_id) in self.masks if of == im_id), default=-1)
+
     def check_folders(self, scene: SceneRecords) -> Iterator[Finding]:
         """A folder of pictures has one for each image, a folder of masks one for each instance, and no other."""
         root = scene.paths.root
@@ -281,9 +306,10 @@ def _check_image(scene: SceneRecords, files: SceneFiles, im_id: int) -> Iterator
     gt, infos = scene.gt.get(im_id, []), scene.gt_info.get(im_id, [])
     masks = [
         InstanceMasks(*(files.read_mask(folder, (im_id, gt_id), pictures) for folder in _MASKS))
-        for gt_id in range(len(gt))
+        for gt_id in range(max(len(gt), files.n_instances(im_id)))
     ]
     yield from pictures.findings
+    masks = masks[: len(gt)]
     yield from check_masks(scene.paths, im_id, masks, exact=False)
     where_depth: Mask | None = None
     if not (scene.paths.root / "depth").exists() and files.shape is not None:
@@ -309,7 +335,7 @@ def _size(path: Path) -> tuple[int, int] | None:
 def _decode_any(data: bytes, path: Path) -> NDArray[Any]:
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
-        raise CutError(f"{path}: cannot be decoded, cut off or damaged")
+        raise DamagedImageError(f"{path}: cannot be decoded, cut off or damaged")
     return image
 
 

@@ -18,7 +18,7 @@ from synthetless.dataset.layout import ScenePaths
 from synthetless.dataset.records import MIN_VISIB_FRACT, CocoAnnotation, GtInfoEntry, amodal_box, uncompressed_rle
 from synthetless.errors import UserError
 from synthetless.io.files import read_bytes
-from synthetless.io.images import decode_mask
+from synthetless.io.images import DamagedImageError, decode_mask
 from synthetless.validation.report import Finding, bare
 
 Array = NDArray[np.float64]
@@ -51,7 +51,7 @@ class Pictures:
             return None
         try:
             return self._read(path, decode)
-        except CutError as error:
+        except DamagedImageError as error:
             self.findings.append(Finding("unreadable", path, bare(error, path), self._im_id, gt_id))
         except ValueError as error:
             self.findings.append(Finding("picture", path, bare(error, path), self._im_id, gt_id))
@@ -61,9 +61,9 @@ class Pictures:
         try:
             data = read_bytes(path)
         except ValueError as error:
-            raise CutError(str(error)) from None
+            raise DamagedImageError(str(error)) from None
         if fault := container_fault(data):
-            raise CutError(fault)
+            raise DamagedImageError(fault)
         key = decode, data
         if key not in self._decoded:
             self._decoded[key] = decode(data, path)
@@ -72,10 +72,6 @@ class Pictures:
             (rows, columns), (height, width) = pixels.shape[:2], self._shape
             raise UserError(f"is {columns}x{rows} pixels; {width}x{height} are expected")
         return pixels
-
-
-class CutError(UserError):
-    """A file that cannot be decoded because some of it is missing or damaged."""
 
 
 def can_decode_exr() -> bool:
@@ -91,7 +87,7 @@ def decode_exr(data: bytes, path: Path) -> NDArray[Any]:
         with OpenEXR.File(str(path)) as content:
             pixels = np.asarray(content.channels()["RGB"].pixels)
     except (RuntimeError, KeyError, ValueError) as error:
-        raise CutError(f"{path}: cannot be decoded ({' '.join(str(error).split())})") from None
+        raise DamagedImageError(f"{path}: cannot be decoded ({' '.join(str(error).split())})") from None
     if pixels.ndim != 3 or pixels.shape[2] != 3 or not np.isfinite(pixels).all():
         raise UserError(f"{path}: has the shape {pixels.shape} or numbers that are not finite; RGB is needed")
     return pixels

@@ -92,12 +92,13 @@ class SceneRecords:
 
     @property
     def image_ids(self) -> list[int]:
-        """Images with a camera, poses and as many entries in scene_gt_info.json."""
-        return [
-            im_id
-            for im_id, gt in self.gt.items()
-            if im_id in self.camera and im_id in self.gt_info and len(self.gt_info[im_id]) == len(gt)
-        ]
+        """Images that are complete."""
+        return [im_id for im_id in self.gt if self.is_complete(im_id)]
+
+    def is_complete(self, im_id: int) -> bool:
+        """Whether an image has a camera, poses and as many entries in scene_gt_info.json."""
+        together = im_id in self.gt and im_id in self.camera and im_id in self.gt_info
+        return together and len(self.gt_info[im_id]) == len(self.gt[im_id])
 
 
 def read_entries(path: Path, form: Any, findings: list[Finding]) -> dict[int, Any]:

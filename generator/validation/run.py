@@ -68,14 +68,19 @@ def validate(
         workers: processes; one per available core if None.
 
     Raises:
-        UserError: there is no dataset, or an export is not there or of no known kind, or exports of an adopted dataset
-            are to be compared; or another process changes the dataset meanwhile.
+        UserError: there is no dataset, or an export is not there or of no known kind, or an adopted
+            dataset is to be recomputed or compared with exports; or another process changes the dataset meanwhile.
     """
     root, exports = dataset.resolve(), tuple(path.resolve() for path in exports)
     _require(root, exports, limit)
     with undisturbed(root):
         if is_adopted(root):
-            return _validate_adopted(root, exports, limit, workers)
+            if exports or sample is None:
+                what = "--export" if exports else "--deep"
+                raise UserError(
+                    f"{root}: no {DATASET_FILE}; {what} is for datasets that generate made, not for adopted ones"
+                )
+            return _validate_adopted(root, limit, workers)
         return _validate_own(root, sample, exports, limit, workers)
 
 
@@ -109,9 +114,7 @@ def _validate_own(root: Path, sample: int | None, exports: tuple[Path, ...], lim
     )
 
 
-def _validate_adopted(root: Path, exports: tuple[Path, ...], limit: int, workers: int | None) -> Report:
-    if exports:
-        raise UserError(f"{root}: no {DATASET_FILE}; --export is for datasets that generate made, not for adopted ones")
+def _validate_adopted(root: Path, limit: int, workers: int | None) -> Report:
     foreign, findings = read_foreign(root, limit)
     tally = Tally(limit)
     tally.add(findings)
@@ -228,10 +231,11 @@ def check_scene(task: SceneTask) -> SceneResult:
         tally.add(unmatched)
         image_ids, instances = tuple(scene.gt), sum(len(gt) for gt in scene.gt.values())
     recomputed = skipped = 0
-    for im_id in scene.image_ids[task.part :: task.parts]:
-        expected = recompute(source, scene.spec.get(im_id)) if im_id in task.recomputed else None
+    for im_id in [plan.im_id for plan in task.plans][task.part :: task.parts]:
+        wanted = im_id in task.recomputed and im_id in scene.gt
+        expected = recompute(source, scene.spec.get(im_id)) if wanted and scene.is_complete(im_id) else None
         recomputed += expected is not None
-        skipped += expected is None and im_id in task.recomputed
+        skipped += wanted and expected is None
         tally.add(check_image(source, scene, im_id, annotations.get(im_id, {}), expected))
     return SceneResult(task.scene_id, tally, image_ids, instances, stale, recomputed, skipped)
 

@@ -148,6 +148,10 @@ def read_source(root: Path, header: Header) -> tuple[Source, list[Finding]]:
     infos, obj_ids, faults = read_infos(folder / INFO_FILE)
     findings += faults
     models = _read_models(folder, infos, header.models_sha256, findings)
+    for obj_id in sorted(obj_ids ^ header.models_sha256.keys()) if obj_ids else ():
+        there = "an entry" if obj_id in obj_ids else "no entry"
+        message = f"has {there} for object {obj_id}; {DATASET_FILE} says otherwise"
+        findings.append(Finding("models", folder / INFO_FILE, message))
     findings += _check_camera_file(root / CAMERA_FILE, header.recipe)
     table = read_table(root, infos, findings)
     if table is not None:
@@ -235,9 +239,6 @@ def _read_models(
         findings: gets what is wrong.
     """
     path = folder / INFO_FILE
-    for obj_id in sorted(infos.keys() ^ digests.keys()) if infos else ():
-        there = "an entry" if obj_id in infos else "no usable entry"
-        findings.append(Finding("models", path, f"has {there} for object {obj_id}; dataset.json says otherwise"))
     models: dict[int, ObjectModel] = {}
     known = {path}
     for obj_id, digest in sorted(digests.items()):

@@ -15,10 +15,12 @@ from damage_kit import IMAGE, WHOLE, Victim
 from synthetless.dataset.labels import label_scene
 from synthetless.dataset.layout import ScenePaths
 from synthetless.dataset.records import read_scene_json, write_scene_json
+from synthetless.dataset.relabel import relabel
+from synthetless.io.files import locked
 from synthetless.io.images import encode_normals, encode_object_coordinates
 from synthetless.symmetry import SymmetryTable
 from synthetless.validation import Report, validate
-from synthetless.validation.run import SceneTask, check_scene
+from synthetless.validation.run import SceneResult, SceneTask, check_scene
 
 EVERYTHING = "outputs=[rgb, depth, masks, normals, object_coordinates, exr]"
 MAKES = {
@@ -74,6 +76,40 @@ def test_rays_that_cannot_be_cast_are_noted(cluttered: tuple[Path, Path]) -> Non
     assert report.valid
     assert report.recomputed_images == 0
     assert "6 images could not be recomputed" in report.notes[0]
+
+
+def test_a_sample_is_spread_evenly_and_noted(valid: Path) -> None:
+    report = validate(valid, sample=2, workers=1)
+    assert report.valid and report.recomputed_images == 2
+    assert report.notes == ("2 of 6 images were recomputed, evenly spread; --deep recomputes every one",)
+    assert validate(valid, sample=None, workers=1).recomputed_images == 6
+
+
+def test_a_dataset_that_is_being_written_is_not_judged(valid: Path, tmp_path: Path) -> None:
+    root = tmp_path / "d"
+    shutil.copytree(valid, root)
+    with locked(root), pytest.raises(ValueError, match="another synthetless is writing here, or was meanwhile"):
+        validate(root, workers=1)
+    assert validate(root, workers=1).valid
+
+
+def test_a_dataset_that_was_relabelled_meanwhile_is_not_judged(
+    valid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between the reading of symmetries.json and that of the labels."""
+    root = tmp_path / "d"
+    shutil.copytree(valid, root)
+
+    def relabel_first(task: SceneTask) -> SceneResult:
+        relabel(root, scheme="atlas", workers=1)
+        return check_scene(task)
+
+    monkeypatch.setattr("synthetless.validation.run.check_scene", relabel_first)
+    with pytest.raises(ValueError, match="another synthetless is writing here, or was meanwhile"):
+        validate(root, workers=1)
+    monkeypatch.undo()
+    with valid_dataset.small_scene_folders():
+        assert validate(root, workers=1).valid
 
 
 def test_workers_find_the_same(valid: Path, tmp_path: Path) -> None:

@@ -104,3 +104,27 @@ def test_no_damage_is_too_much(valid: Path, tmp_path: Path, seed: int) -> None:
     node[key] = values[rng.integers(len(values))]
     path.write_text(json.dumps(content))
     validate(root, workers=1).lines()
+
+
+ODD_INFOS = ["{}", "[]", "null", "5", '{"1": 5}', '{"1": []}', '{"x": {}}', '{"1": {}}', '{"1": {"size_x": [30]}}', "{"]
+
+
+@pytest.mark.parametrize("text", ODD_INFOS)
+def test_an_odd_models_info_is_a_finding(valid: Path, tmp_path: Path, text: str) -> None:
+    root = tmp_path / "dataset"
+    shutil.copytree(valid, root)
+    (root / "models/models_info.json").write_text(text)
+    report = validate(root, workers=1)
+    assert "models_info.json" in "\n".join(report.lines())
+    assert (report.images, report.instances) == (6, 34)
+
+
+@pytest.mark.parametrize("key", ["size_x", "diameter", "symmetries_discrete", "symmetries_continuous"])
+@pytest.mark.parametrize("value", [[30], {}, "30", float("nan"), [[[]]], -1e400])
+def test_an_odd_value_of_an_object_is_a_finding(valid: Path, tmp_path: Path, key: str, value: Any) -> None:
+    root = tmp_path / "dataset"
+    shutil.copytree(valid, root)
+    with Victim(root).json(root / "models/models_info.json") as infos:
+        infos["2"][key] = value
+    found = [f for f in validate(root, workers=1).findings if f.file.name == "models_info.json"]
+    assert found and all(f.message.startswith("object 2") for f in found), found
