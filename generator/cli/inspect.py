@@ -8,14 +8,8 @@ from typing import Annotated
 
 import typer
 
-from synthetless.cli.generate import EXIT_FAILED
 from synthetless.cli.options import Split, Workers
-from synthetless.dataset.labels import undisturbed
-from synthetless.doctor import examine, is_fit, to_json, to_text
-from synthetless.io.files import read_json
-from synthetless.preview import write_preview
-from synthetless.preview.pages import STATISTICS_FILE
-from synthetless.validation import SAMPLE, validate
+from synthetless.cli.terminal import EXIT_FAILED, say
 
 
 def doctor_command(
@@ -26,8 +20,10 @@ def doctor_command(
 
     Says what to do where it cannot; then the exit code is 1.
     """
+    from synthetless.doctor import examine, is_fit, to_json, to_text
+
     checks = examine(out)
-    print(to_json(checks) if as_json else to_text(checks))
+    say(to_json(checks) if as_json else to_text(checks))
     if not is_fit(checks):
         raise typer.Exit(EXIT_FAILED)
 
@@ -43,18 +39,23 @@ def preview_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print the statistics as JSON.")] = False,
 ) -> None:
     """Make a gallery and statistics for the browser."""
+    from synthetless.dataset.labels import undisturbed
+    from synthetless.io.files import read_json
+    from synthetless.preview import write_preview
+    from synthetless.preview.pages import STATISTICS_FILE
+
     with undisturbed(dataset, may_grow=True):
         page = write_preview(dataset, to, split, images, workers)
     statistics = read_json(page.parent / STATISTICS_FILE)
-    print(json.dumps({"page": str(page), "statistics": statistics}) if as_json else f"preview: {page}")
+    say(json.dumps({"page": str(page), "statistics": statistics}) if as_json else f"preview: {page}")
 
 
 def validate_command(
     dataset: Annotated[Path, typer.Argument(help="The dataset's folder.")],
     deep: Annotated[bool, typer.Option("--deep", help="Recompute every image, however many there are.")] = False,
     sample: Annotated[
-        int, typer.Option(min=0, metavar="N", help="Recompute so many images at most, evenly spread.")
-    ] = SAMPLE,
+        int | None, typer.Option(min=0, metavar="N", help="Recompute N images, evenly spread; default: 30000.")
+    ] = None,
     exports: Annotated[
         list[Path] | None,
         typer.Option(
@@ -67,7 +68,10 @@ def validate_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Check every file, every label, and both against each other."""
-    found = validate(dataset, None if deep else sample, exports or (), limit)
-    print(json.dumps(found.to_json()) if as_json else "\n".join(found.lines()))
+    from synthetless.validation import SAMPLE, validate
+
+    chosen = None if deep else SAMPLE if sample is None else sample
+    found = validate(dataset, chosen, exports or (), limit)
+    say(json.dumps(found.to_json()) if as_json else "\n".join(found.lines()))
     if not found.valid:
         raise typer.Exit(EXIT_FAILED)

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, NotRequired
+from typing import Annotated, Any, NotRequired, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,7 @@ Positive = Annotated[float, Field(gt=0, le=1e12)]
 Count = Annotated[int, Field(ge=0)]
 Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Matrix = Annotated[list[Number], Field(min_length=9, max_length=9)]
+Kind = TypeVar("Kind")
 Entry = dict[str, Any]
 ModelInfo = Mapping[str, Any]
 """An object's entry in models_info.json."""
@@ -244,15 +245,15 @@ class SchemaFault:
 
 
 @cache
-def schema(form: Any) -> TypeAdapter[Any]:
-    """The schema of a type of this module; made once, since that takes long."""
-    return TypeAdapter(form)
+def schema_of(kind: type[Kind]) -> TypeAdapter[Kind]:
+    """The schema of a type of JSON data; made once, since that takes long."""
+    return TypeAdapter(kind)
 
 
-def schema_faults(form: Any, value: Any) -> list[SchemaFault]:
-    """Every departure of a parsed JSON value from the schema of a type of this module, ``list[GtEntry]`` say."""
+def schema_faults(kind: Any, value: Any) -> list[SchemaFault]:
+    """Every departure of a parsed JSON value from the schema of a type, ``list[GtEntry]`` say."""
     try:
-        schema(form).validate_python(value)
+        schema_of(kind).validate_python(value)
     except ValidationError as error:
         return [_schema_fault(fault) for fault in error.errors(include_url=False)]
     return []

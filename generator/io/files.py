@@ -6,6 +6,7 @@ import errno
 import fcntl
 import json
 import os
+import re
 import shutil
 import socket
 import stat
@@ -15,6 +16,8 @@ from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 from typing import Any, BinaryIO
+
+import psutil
 
 from synthetless.errors import UserError
 
@@ -31,7 +34,7 @@ def atomic_file(path: Path, durable: bool = False) -> Iterator[BinaryIO]:
     Raises:
         UserError: the file cannot be written.
     """
-    draft = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.part")
+    draft = _draft(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with draft.open("wb") as file:
@@ -69,25 +72,73 @@ def replace_file(source: Path, target: Path) -> None:
 
 
 @contextmanager
-def atomic_folder(path: Path) -> Iterator[Path]:
+def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
     """A folder to fill, which becomes ``path`` when the block ends well and vanishes otherwise.
 
+    Where several processes fill the same folder, the first to end has it, and the others fail.
+
+    Args:
+        path: where the folder is to be; missing parent folders are made.
+        replace: take the place of a folder that is there, with everything in it.
+
     Raises:
-        UserError: ``path`` is a file or a folder that holds something, or cannot be written.
+        UserError: ``path`` is a file, or a folder that holds something and is not to be replaced, or cannot be written.
     """
     path = path.resolve()
-    draft = path.with_name(f".{path.name}.part")
+    draft = _draft(path)
     try:
-        if path.is_file() or (path.is_dir() and any(path.iterdir())):
+        if path.is_file() or (not replace and path.is_dir() and any(path.iterdir())):
             raise UserError(f"{path}: exists already; give a new or an empty folder")
-        shutil.rmtree(draft, ignore_errors=True)
+        remove_drafts(path.parent, path.name)
         draft.mkdir(parents=True)
         yield draft
-        draft.replace(path)
+        if replace and path.exists():
+            former = draft.with_suffix(".former.part")
+            path.replace(former)
+            draft.replace(path)
+            shutil.rmtree(former, ignore_errors=True)
+        else:
+            draft.replace(path)
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror or error})") from error
     finally:
         shutil.rmtree(draft, ignore_errors=True)
+
+
+def remove_file(path: Path) -> None:
+    """Remove a file, if it is there.
+
+    Raises:
+        UserError: it cannot be removed.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be removed ({error.strerror})") from None
+
+
+def remove_drafts(folder: Path, name: str | None = None) -> None:
+    """Remove what processes of this machine left in a folder when they were killed while they wrote to it.
+
+    Args:
+        folder: where the files or folders were to be; need not exist.
+        name: of the one that was being written; None for any.
+    """
+    host = re.escape(socket.gethostname())
+    pattern = re.compile(rf"\.{'.+' if name is None else re.escape(name)}\.{host}\.(\d+)(\.former)?\.part")
+    for left in sorted(folder.iterdir()) if folder.is_dir() else ():
+        match = pattern.fullmatch(left.name)
+        if match is None or psutil.pid_exists(int(match[1])):
+            continue
+        if left.is_dir() and not left.is_symlink():
+            shutil.rmtree(left, ignore_errors=True)
+        else:
+            left.unlink(missing_ok=True)
+
+
+def _draft(path: Path) -> Path:
+    """What is being written, beside its place: a name of this process, so that others write theirs."""
+    return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.part")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -188,6 +239,12 @@ def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return content
 
 
+def nearest_existing(folder: Path) -> Path:
+    """The folder itself, or the innermost of its parents that exists."""
+    absolute = folder.absolute()
+    return next(place for place in (absolute, *absolute.parents) if place.is_dir())
+
+
 class LockedError(UserError):
     """Another process is at work in the folder; the message is one line."""
 
@@ -238,21 +295,45 @@ def in_turn(root: Path) -> Iterator[None]:
             continue
 
 
+def user_folder() -> Path:
+    """This user's own folder among the temporary files of this machine; what is in it may be deleted at any time.
+
+    Raises:
+        UserError: it cannot be made; or it is somebody else's, or open to others, who could put files of theirs there.
+    """
+    folder = Path(tempfile.gettempdir()) / f"synthetless-{os.getuid()}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be used ({error.strerror}); remove it, or set TMPDIR") from None
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise UserError(f"{folder}: must be a folder of yours with mode 0700, no link; remove it, or set TMPDIR")
+    return folder
+
+
 def claim(name: str) -> int:
     """Take the first number, counted from 0, that no other process of this user on this machine has taken.
 
     It is given back when this process ends, however that comes about.
+
+    Raises:
+        UserError: the user's folder among the temporary files cannot be used.
     """
-    folder = Path(tempfile.gettempdir()) / f"synthetless-{os.getuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
+    folder = user_folder()
     for number in count():
-        lock = os.open(folder / f"{name}-{number}.lock", os.O_CREAT | os.O_RDWR, 0o600)
+        path = folder / f"{name}-{number}.lock"
+        try:
+            lock = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o600)
+        except OSError as error:
+            raise UserError(f"{path}: cannot be written ({error.strerror})") from None
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the descriptor is open
-        except OSError:
-            os.close(lock)
-        else:
             return number
+        except BlockingIOError:
+            os.close(lock)
+        except OSError as error:
+            raise UserError(f"{path}: cannot be locked ({error.strerror}); set TMPDIR to another folder") from None
     raise AssertionError("there are always more numbers")
 
 
@@ -267,12 +348,20 @@ def _flock(path: Path, mode: int, busy: str) -> Iterator[None]:
         try:
             fcntl.flock(lock, mode)
             taken_away = not os.path.samestat(path.stat(), os.fstat(lock.fileno()))
-        except OSError:
+        except BlockingIOError:
             raise LockedError(busy) from None
+        except FileNotFoundError:
+            taken_away = True
+        except OSError as error:
+            raise UserError(
+                f"{path}: this file system cannot lock files ({error.strerror}); "
+                "give a folder on another one, or mount it with locks (Lustre: -o flock)"
+            ) from None
         if taken_away:
             raise LockedError(busy)
         try:
             yield
         finally:
             if mode & fcntl.LOCK_EX:
-                path.unlink(missing_ok=True)
+                with suppress(OSError):  # the folder may have become read-only; the file alone locks nobody out
+                    path.unlink()

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synthetless.errors import UserError
+from synthetless.io.documents import shown
 from synthetless.symmetry.point_groups import (
     MAX_ORDER,
     Family,
@@ -101,7 +102,7 @@ def recognise(info: Mapping[str, Any]) -> Recognised:
             elements, no common fixed point, a misspelt field.
     """
     if not isinstance(info, Mapping):
-        raise UserError(f"{info!r} is not an entry of models_info.json, which maps field names to values")
+        raise UserError(f"{shown(info)} is not an entry of models_info.json, which maps field names to values")
     refuse_misspelt(info, _FIELDS)
     lines = [_line(item, i) for i, item in enumerate(_listed(info, "symmetries_continuous"))]
     motions = [_motion(item, i) for i, item in enumerate(_listed(info, "symmetries_discrete"))]
@@ -119,15 +120,23 @@ def refuse_misspelt(mapping: Mapping[Any, Any], known: Collection[str]) -> None:
     Raises:
         UserError: with the key, and the one that was probably meant.
     """
-    plain = {_plain(name): name for name in known}
     for key in mapping:
-        if key not in known and (nearest := difflib.get_close_matches(_plain(key), plain, n=1, cutoff=0.75)):
-            raise UserError(f"unknown key {str(key)!r}: did you mean {plain[nearest[0]]!r}?")
+        if key not in known:
+            written, sorted_words = _spellings(str(key))
+            for name in known:
+                right, right_sorted = _spellings(name)
+                if _are_close(written, right) or _are_close(sorted_words, right_sorted):
+                    raise UserError(f"unknown key {str(key)!r}: did you mean {name!r}?")
 
 
-def _plain(key: object) -> str:
-    """A key without what people write differently: case, hyphens, the order of words."""
-    return "_".join(sorted(str(key).lower().replace("-", "_").split("_")))
+def _spellings(key: str) -> tuple[str, str]:
+    """A key as it is written, but for case and hyphens, and with its words sorted."""
+    plain = key.lower().replace("-", "_")
+    return plain, "_".join(sorted(plain.split("_")))
+
+
+def _are_close(one: str, other: str) -> bool:
+    return difflib.SequenceMatcher(None, one, other).ratio() >= 0.75
 
 
 def recognise_finite(rotations: Sequence[Floats]) -> Placement:
@@ -351,7 +360,7 @@ def _listed(info: Mapping[str, Any], key: str) -> Sequence[Any]:
     if value is None:
         return []
     if isinstance(value, str | Mapping) or not isinstance(value, Sequence):
-        raise UserError(f"{key} is {value!r}, not a list")
+        raise UserError(f"{key} is {shown(value)}, not a list")
     return value
 
 
@@ -361,7 +370,7 @@ def _numbers(value: object, size: int, what: str) -> Floats:
     except (TypeError, ValueError):
         numbers = np.empty(0)
     if len(numbers) != size or not np.isfinite(numbers).all():
-        raise UserError(f"{what} is {value!r}, not {size} finite numbers")
+        raise UserError(f"{what} is {shown(value)}, not {size} finite numbers")
     return numbers
 
 
@@ -370,7 +379,7 @@ def _line(item: object, i: int) -> Line:
     if isinstance(item, Mapping):
         refuse_misspelt(item, ("axis", "offset"))
     if not isinstance(item, Mapping) or "axis" not in item:
-        raise UserError(f"{what} is {item!r}, not an {{axis, offset}} pair")
+        raise UserError(f"{what} is {shown(item)}, not an {{axis, offset}} pair")
     axis = _numbers(item["axis"], 3, f"{what}: axis")
     if np.linalg.norm(axis) < 1e-9:
         raise UserError(f"{what}: axis is zero; a symmetry axis needs a direction, such as [0, 0, 1]")

@@ -6,9 +6,9 @@ By hand (YAML or JSON):
     object 27: {group: C4}
     object 31: {group: D3, axis: [0, 0, 1], secondary_axis: [1, 0, 0]}
 
-As `symmetries.json` beside a dataset: {"scheme", "allocentric", "objects": {id: entry}}, where an entry also says what
-follows from the group: order ("inf" for a continuous one), n_regressors, anchors (unit quaternions wxyz, in the role of
-`R_m2c`), separation_deg.
+As `symmetries.json` beside a dataset: {"scheme", "allocentric", "objects": {id: entry}}, and "decimals" if the poses
+that are labelled were rounded to less than 15 of them. An entry also says what follows from the group: order ("inf" for
+a continuous one), n_regressors, anchors (unit quaternions wxyz, in the role of `R_m2c`), separation_deg.
 """
 
 from __future__ import annotations
@@ -17,28 +17,29 @@ import difflib
 import hashlib
 import json
 import re
-from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
-import yaml
 
 from synthetless.errors import UserError
-from synthetless.io.files import atomic_write, read_bytes
-from synthetless.symmetry.atlas import SCHEMES, Scheme
-from synthetless.symmetry.canonical import CanonicalMap
+from synthetless.io.documents import read_document, shown
+from synthetless.io.files import atomic_write
+from synthetless.symmetry.atlas import SCHEMES, Scheme, former_anchors
+from synthetless.symmetry.canonical import FULL_DECIMALS, CanonicalMap, check_decimals
 from synthetless.symmetry.groups import SymmetryGroup
+from synthetless.symmetry.point_groups import parse_name
 
 Matrix = tuple[tuple[float, ...], ...]
 
 TABLE_FILE = "symmetries.json"
 MODELS_INFO_FILE = "models_info.json"
 
-_TABLE_KEYS = ("scheme", "allocentric", "objects")
+TABLE_KEYS = ("scheme", "allocentric", "decimals", "objects")
+
 _GIVEN_KEYS = ("group", "axis", "secondary_axis", "frame", "offset", "offset_mm", "reference_rotation")
 _DERIVED_KEYS = ("order", "n_regressors", "anchors", "separation_deg")
 _BOP_SIZES = tuple(f"{what}_{axis}" for what in ("min", "max", "size") for axis in "xyz")
@@ -58,7 +59,7 @@ class SymmetryEntry:
     group: SymmetryGroup
     reference_rotation: Matrix | None = None
 
-    def canonical_map(self, scheme: Scheme, allocentric: bool = False, decimals: int = 9) -> CanonicalMap:
+    def canonical_map(self, scheme: Scheme, allocentric: bool = False, decimals: int = FULL_DECIMALS) -> CanonicalMap:
         """The map that labels this object's poses."""
         return CanonicalMap(self.group, scheme, self.reference_rotation, allocentric, decimals)
 
@@ -71,13 +72,16 @@ class SymmetryTable:
         entries: by object id, ascending.
         scheme: `pitteri2019` or `atlas`.
         allocentric: whether rotations are judged relative to the ray to the object (see `CanonicalMap`).
+        decimals: with how many the poses that are labelled are stored (see `CanonicalMap`).
     """
 
     entries: Mapping[int, SymmetryEntry]
     scheme: Scheme = "pitteri2019"
     allocentric: bool = False
+    decimals: int = FULL_DECIMALS
 
     def __post_init__(self) -> None:
+        check_decimals(self.decimals)
         _check_scheme(self.scheme)
         ordered = {obj_id: self.entries[obj_id] for obj_id in sorted(self.entries)}
         object.__setattr__(self, "entries", MappingProxyType(ordered))
@@ -137,20 +141,21 @@ class SymmetryTable:
             raise UserError(
                 "a symmetry table is a mapping of objects, such as 'object 26: {group: C2, axis: [0, 0, 1]}'"
             )
-        objects = data.get("objects", {key: value for key, value in data.items() if key not in _TABLE_KEYS})
+        objects = data.get("objects", {key: value for key, value in data.items() if key not in TABLE_KEYS})
         if "objects" in data:
-            _refuse_unknown(data, _TABLE_KEYS, "the symmetry table")
+            _refuse_unknown(data, TABLE_KEYS, "the symmetry table")
         scheme, allocentric = data.get("scheme", SCHEMES[0]), data.get("allocentric", False)
         _check_scheme(scheme)
         if not isinstance(allocentric, bool):
-            raise UserError(f"allocentric is {allocentric!r}, not true or false")
+            raise UserError(f"allocentric is {shown(allocentric)}, not true or false")
         entries = {}
-        for obj_id, value in _by_id(objects, f"objects is {objects!r}, not a mapping of object ids to groups").items():
+        by_id = _by_id(objects, f"objects is {shown(objects)}, not a mapping of object ids to groups")
+        for obj_id, value in by_id.items():
             try:
                 entries[obj_id] = _entry(value, scheme, f"object {obj_id}")
             except UserError as error:
                 raise UserError(f"object {obj_id}: {error}") from error
-        return cls(entries, scheme, allocentric)
+        return cls(entries, scheme, allocentric, data.get("decimals", FULL_DECIMALS))
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
@@ -163,11 +168,10 @@ class SymmetryTable:
                 the file's name.
         """
         file = _file_of(Path(path))
-        data = read_bytes(file)
+        content = read_document(file)
         try:
-            content = _parsed(data.decode())
             return cls.from_models_info(content) if file.name == MODELS_INFO_FILE else cls.from_dict(content)
-        except ValueError as error:
+        except UserError as error:
             raise UserError(f"{file}: {error}") from error
 
     def write(self, path: str | Path) -> None:
@@ -176,21 +180,25 @@ class SymmetryTable:
         Raises:
             UserError: the file cannot be written.
         """
-        head = [f'"scheme": {json.dumps(self.scheme)}', f'"allocentric": {json.dumps(self.allocentric)}']
-        lines = [f"  {json.dumps(key)}: {json.dumps(entry)}" for key, entry in self.to_dict()["objects"].items()]
+        content = self.to_dict()
+        head = [f'"{key}": {json.dumps(content[key])}' for key in content if key != "objects"]
+        lines = [f"  {json.dumps(key)}: {json.dumps(entry)}" for key, entry in content["objects"].items()]
         text = "{\n" + ",\n".join(head) + ',\n"objects": {\n' + ",\n".join(lines) + "\n}}\n"
         atomic_write(Path(path), text.encode(), durable=True)
 
     def to_dict(self) -> dict[str, Any]:
         """What `write` writes: plain dicts, lists and numbers."""
         objects = {str(obj_id): self._described(entry) for obj_id, entry in self.entries.items()}
-        return {"scheme": self.scheme, "allocentric": self.allocentric, "objects": objects}
+        head: dict[str, Any] = {"scheme": self.scheme, "allocentric": self.allocentric}
+        if self.decimals < FULL_DECIMALS:
+            head["decimals"] = self.decimals
+        return head | {"objects": objects}
 
     def digest(self) -> str:
         """SHA-256 (hex) of the table's canonical JSON: equal digests, equal labels."""
         return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
 
-    def canonical_map(self, obj_id: int, decimals: int = 9) -> CanonicalMap:
+    def canonical_map(self, obj_id: int) -> CanonicalMap:
         """The map that labels an object's poses.
 
         Raises:
@@ -198,7 +206,7 @@ class SymmetryTable:
         """
         if obj_id not in self.entries:
             raise UserError(f"object {obj_id} is not in the symmetry table, which has {_listed(self.entries)}")
-        return self.entries[obj_id].canonical_map(self.scheme, self.allocentric, decimals)
+        return self.entries[obj_id].canonical_map(self.scheme, self.allocentric, self.decimals)
 
     def _described(self, entry: SymmetryEntry) -> dict[str, Any]:
         group = entry.group
@@ -239,7 +247,7 @@ def _entry(value: object, scheme: Scheme, what: str) -> SymmetryEntry:
     if isinstance(value, str):
         return SymmetryEntry(SymmetryGroup.from_name(value))
     if not isinstance(value, Mapping):
-        raise UserError(f"{value!r} describes no symmetries; write for example {{group: C2, axis: [0, 0, 1]}}")
+        raise UserError(f"{shown(value)} describes no symmetries; write for example {{group: C2, axis: [0, 0, 1]}}")
     if "group" not in value and not value.keys().isdisjoint(_BOP_KEYS):
         return SymmetryEntry(SymmetryGroup.from_bop(value, what))
     _refuse_unknown(value, _GIVEN_KEYS + _DERIVED_KEYS, "it", suggested=_BOP_KEYS)
@@ -256,7 +264,7 @@ def _entry(value: object, scheme: Scheme, what: str) -> SymmetryEntry:
         frame=value.get("frame"),
     )
     entry = SymmetryEntry(group, _reference(value.get("reference_rotation")))
-    _check_derived(value, _derived(entry, scheme))
+    _check_derived(value, entry, scheme)
     return entry
 
 
@@ -268,17 +276,27 @@ def _reference(value: object) -> Matrix | None:
     except (TypeError, ValueError):
         matrix = np.empty(0)
     if matrix.size != 9:
-        raise UserError(f"reference_rotation is {value!r}, not 3 rows of 3 numbers")
+        raise UserError(f"reference_rotation is {shown(value)}, not 3 rows of 3 numbers")
     rows = matrix.reshape(3, 3)
     CanonicalMap(SymmetryGroup.trivial(), reference_rotation=rows)  # refuses what is no rotation
     return tuple(tuple(float(number) for number in row) for row in rows)
 
 
-def _check_derived(given: Mapping[Any, Any], expected: Mapping[str, Any]) -> None:
+def _check_derived(given: Mapping[Any, Any], entry: SymmetryEntry, scheme: Scheme) -> None:
     """A file whose group was edited must not keep saying what followed from the former one."""
-    for key in _DERIVED_KEYS:
-        if key in given and not _agree(given[key], expected[key]):
-            raise UserError(f"{key} does not follow from the group and scheme: leave {', '.join(_DERIVED_KEYS)} out")
+    expected = _derived(entry, scheme)
+    wrong = [key for key in _DERIVED_KEYS if key in given and not _agree(given[key], expected[key])]
+    if wrong and not _is_of_earlier_version(given, wrong, entry, scheme):
+        raise UserError(f"{wrong[0]} does not follow from the group and scheme: leave {', '.join(_DERIVED_KEYS)} out")
+
+
+def _is_of_earlier_version(given: Mapping[Any, Any], wrong: list[str], entry: SymmetryEntry, scheme: Scheme) -> bool:
+    """Whether the file was right when it was written: its group stands, only its labels have to be made again."""
+    if scheme != "pitteri2019" or not {"anchors"} <= set(wrong) <= {"anchors", "separation_deg"}:
+        return False
+    return _agree(
+        given["anchors"], entry.canonical_map(scheme).placed_wxyz(former_anchors(parse_name(entry.group.name)))
+    )
 
 
 def _agree(a: object, b: object) -> bool:
@@ -294,7 +312,7 @@ def _agree(a: object, b: object) -> bool:
 def _object_id(key: object) -> int:
     matched = _OBJECT_KEY.fullmatch(str(key).strip())
     if matched is None:
-        raise UserError(f"{key!r} names no object: write 'object 26' or 26{_suggestion(str(key), _TABLE_KEYS)}")
+        raise UserError(f"{key!r} names no object: write 'object 26' or 26{_suggestion(str(key), TABLE_KEYS)}")
     return int(matched[1])
 
 
@@ -330,32 +348,3 @@ def _check_scheme(scheme: object) -> None:
 def _listed(ids: Iterable[int]) -> str:
     text = ", ".join(map(str, ids))
     return f"objects {text}" if text else "no objects"
-
-
-def _parsed(text: str) -> object:
-    # JSON first: YAML 1.1 reads 1e-06 as a word.
-    with suppress(json.JSONDecodeError):
-        return json.loads(text, object_pairs_hook=_unique)
-    try:
-        return yaml.load(text, Loader=_UniqueKeyLoader)
-    except yaml.YAMLError as error:
-        raise UserError(f"neither JSON nor YAML ({' '.join(str(error).split())})") from error
-
-
-def _unique(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
-    _refuse_repetition([key for key, _ in pairs])
-    return dict(pairs)
-
-
-def _refuse_repetition(keys: list[Any]) -> None:
-    for key in keys:
-        if keys.count(key) > 1:
-            raise UserError(f"{str(key)!r} is listed twice")
-
-
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """YAML that refuses a key given twice, of which plain YAML silently takes the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        _refuse_repetition([key.value for key, _ in node.value])
-        return super().construct_mapping(node, deep)
