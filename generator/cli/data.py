@@ -70,7 +70,7 @@ def webdataset_command(
     with undisturbed(dataset, may_grow=True):
         if relabel_only:
             relabel_webdataset(dataset, to, split)
-            say(f"labels renewed in {to}")
+            say(f"labels replaced in {to}")
             return
         shards = export_webdataset(dataset, to, split, images_per_shard, shuffle_seed)
     say(f"{len(shards)} images in {len(set(shards.values()))} shards in {to}")

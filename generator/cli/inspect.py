@@ -54,7 +54,8 @@ def validate_command(
     dataset: Annotated[Path, typer.Argument(help="The dataset's folder.")],
     deep: Annotated[bool, typer.Option("--deep", help="Recompute every image, however many there are.")] = False,
     sample: Annotated[
-        int | None, typer.Option(min=0, metavar="N", help="Recompute N images, evenly spread; default: 30000.")
+        int | None,
+        typer.Option(min=0, metavar="N", help="Recompute so many images at most, evenly spread; default: 30000."),
     ] = None,
     exports: Annotated[
         list[Path] | None,
@@ -70,8 +71,8 @@ def validate_command(
     """Check every file, every label, and both against each other."""
     from synthetless.validation import SAMPLE, validate
 
-    chosen = None if deep else SAMPLE if sample is None else sample
-    found = validate(dataset, chosen, exports or (), limit)
+    most = SAMPLE if sample is None else sample
+    found = validate(dataset, None if deep else most, exports or (), limit)
     say(json.dumps(found.to_json()) if as_json else "\n".join(found.lines()))
     if not found.valid:
         raise typer.Exit(EXIT_FAILED)

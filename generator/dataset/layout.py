@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
+from synthetless.config import SPLIT
 from synthetless.errors import UserError
 from synthetless.io.models import INFO_FILE
 
@@ -28,7 +29,6 @@ MODELS_FOLDER = "models"
 RECORDS_FOLDER = ".records"
 FAILURES_FOLDER = ".failures"
 LOGS_FOLDER = ".logs"
-SPLIT = "train_synthetless"
 PREVIEW_FOLDER = "preview"
 _MODELS_FOLDERS = (MODELS_FOLDER, "models_cad", "models_eval")
 _RESERVED = (
@@ -193,7 +193,7 @@ def scene_ids(dataset: Path, split: str = SPLIT) -> list[int]:
     folder = dataset / split
     if not folder.is_dir():
         known = ", ".join(sorted({paths.root.parent.name for paths in scene_folders(dataset, ["scene_camera.json"])}))
-        raise UserError(f"{folder}: no such split; {f'there are {known}' if known else 'this is no BOP dataset'}")
+        raise UserError(f"{folder}: no such split; {f'there are {known}' if known else 'this is not a BOP dataset'}")
     ids = sorted(int(entry.name) for entry in folder.iterdir() if entry.name.isdecimal() and entry.is_dir())
     if not ids:
         raise UserError(f"{folder}: holds no scene folders (000001, ...)")

@@ -8,10 +8,10 @@ https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, NotRequired, TypeVar
+from typing import Annotated, Any, NotRequired
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from synthetless.annotation.instances import InstanceAnnotation
 from synthetless.errors import UserError
 from synthetless.io.documents import shown
 from synthetless.io.files import read_json, write_json
-from synthetless.scenes.spec import Intrinsics, Pose, SceneSpec
+from synthetless.scenes.spec import Intrinsics, Pose, SceneSpec, SensorSpec
 
 MIN_VISIB_FRACT = 0.1
 """Instances with a smaller visible fraction are marked ``ignore`` in scene_gt_coco.json, as bop_toolkit does."""
@@ -37,7 +37,6 @@ Positive = Annotated[float, Field(gt=0, le=1e12)]
 Count = Annotated[int, Field(ge=0)]
 Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Matrix = Annotated[list[Number], Field(min_length=9, max_length=9)]
-Kind = TypeVar("Kind")
 Entry = dict[str, Any]
 ModelInfo = Mapping[str, Any]
 """An object's entry in models_info.json."""
@@ -208,6 +207,7 @@ class ImageSpec:
         instances: number in ``scene.objects`` of each labelled instance, in scene_gt's order.
         scene: what was built.
         settled: pose of each object at rest.
+        sensor: the camera that took the picture; without one, the record leaves it out.
     """
 
     image_id: int
@@ -216,6 +216,7 @@ class ImageSpec:
     instances: tuple[int, ...]
     scene: SceneSpec
     settled: tuple[Pose, ...]
+    sensor: SensorSpec | None = None
 
 
 class ImageRecord(TypedDict):
@@ -245,23 +246,45 @@ class SchemaFault:
 
 
 @cache
-def schema_of(kind: type[Kind]) -> TypeAdapter[Kind]:
-    """The schema of a type of JSON data; made once, since that takes long."""
-    return TypeAdapter(kind)
+def schema(form: Any) -> TypeAdapter[Any]:
+    """The schema of a type of this module; made once, since that takes long."""
+    return TypeAdapter(form)
 
 
-def schema_faults(kind: Any, value: Any) -> list[SchemaFault]:
-    """Every departure of a parsed JSON value from the schema of a type, ``list[GtEntry]`` say."""
+def schema_faults(form: Any, value: Any) -> list[SchemaFault]:
+    """Every departure of a parsed JSON value from the schema of a type of this module, ``list[GtEntry]`` say."""
     try:
-        schema_of(kind).validate_python(value)
+        schema(form).validate_python(value)
     except ValidationError as error:
         return [_schema_fault(fault) for fault in error.errors(include_url=False)]
     return []
 
 
+def validated(form: Any, value: Any, path: Path) -> Any:
+    """A parsed JSON value as a type of this module.
+
+    Raises:
+        UserError: it departs from the schema; with the file, the first place in it, and what was expected.
+    """
+    try:
+        return schema(form).validate_python(value)
+    except ValidationError as error:
+        raise UserError(f"{path}: {_schema_fault(error.errors(include_url=False)[0]).message}") from None
+
+
 def _schema_fault(fault: ErrorDetails) -> SchemaFault:
     name = ".".join(str(part) for part in fault["loc"]) or "it"
+    if fault["type"] == "missing":
+        return SchemaFault(fault["loc"], f"{name} is missing")
     return SchemaFault(fault["loc"], f"{name} is {shown(fault['input'])}: {fault['msg'][0].lower()}{fault['msg'][1:]}")
+
+
+def spec_entry(spec: ImageSpec) -> dict[str, Any]:
+    """An image's line in scene_spec.jsonl."""
+    entry = asdict(spec)
+    if spec.sensor is None:
+        del entry["sensor"]
+    return entry
 
 
 def write_scene_json(path: Path, entries: Mapping[int, Any]) -> None:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synthetless.errors import UserError
+from synthetless.scenes import render
 
 COORDINATE_SCALE_MM = 0.02
 """Object coordinates are stored in steps of this size, so the rounding error is at most 0.01 mm."""
@@ -217,3 +218,22 @@ def encode_exr(linear: NDArray[np.float32]) -> bytes:
         path = Path(folder) / "image.exr"
         OpenEXR.File(header, {"RGB": pixels}).write(str(path))
         return path.read_bytes()
+
+
+def read_exr(path: Path) -> NDArray[np.float32]:
+    """(H, W, 3) float32 of an OpenEXR file of linear light.
+
+    Raises:
+        UserError: it is missing or damaged, holds something else, or the OpenEXR package is not installed.
+    """
+    if not path.is_file():
+        raise UserError(f"{path}: not found")
+    try:
+        linear = render.read_exr(path)
+    except ModuleNotFoundError:
+        raise UserError(f"{path}: to read it, the OpenEXR package is needed; install synthetless[blender]") from None
+    except (RuntimeError, KeyError, ValueError) as error:
+        raise UserError(f"{path}: cannot be decoded ({' '.join(str(error).split())})") from None
+    if linear.ndim != 3 or linear.shape[2] != 3 or not np.isfinite(linear).all():
+        raise UserError(f"{path}: holds an image of shape {linear.shape}; three channels of finite light are needed")
+    return linear

@@ -32,6 +32,7 @@ from synthetless.dataset.records import (
     coco_annotations,
     gt_info_entry,
 )
+from synthetless.dataset.store import planned_sensor
 from synthetless.io.images import (
     COORDINATE_SCALE_MM,
     decode_depth,
@@ -85,6 +86,8 @@ def check_specs(source: Source, scene: SceneRecords, plans: Sequence[ImagePlan])
         if plan is not None and (spec.scene.drop, spec.view) != (plan.drop, plan.view):
             shown = f"shows drop {spec.scene.drop}, view {spec.view}"
             yield Finding("spec", path, f"{shown}; this image is of drop {plan.drop}, view {plan.view}", im_id)
+        if plan is not None and spec.sensor != planned_sensor(source.recipe, plan):
+            yield Finding("spec", path, "records another sensor than the recipe draws for this image", im_id)
         fault = incoherence(spec)
         if fault:
             yield Finding("spec", path, fault, im_id)

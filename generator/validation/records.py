@@ -22,8 +22,8 @@ from synthetless.dataset.records import (
     ImageSpec,
     coco_image,
     read_scene_json,
+    schema,
     schema_faults,
-    schema_of,
 )
 from synthetless.dataset.store import DatasetStore
 from synthetless.io.files import read_json, read_json_lines
@@ -151,7 +151,7 @@ def _read_spec(path: Path, spec_json: dict[int, Any], findings: list[Finding]) -
         place, faults = _image_of(line, "image_id"), schema_faults(ImageSpec, line)
         findings += [Finding("schema", path, f"line {number}: {fault.message}", place) for fault in faults]
         if not faults:
-            image: ImageSpec = schema_of(ImageSpec).validate_python(line)
+            image: ImageSpec = schema(ImageSpec).validate_python(line)
             if image.image_id in recorded:
                 findings.append(Finding("ids", path, f"line {number} records it a second time", image.image_id))
             recorded[image.image_id], spec_json[image.image_id] = image, line
