@@ -22,7 +22,7 @@ import json
 import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
@@ -248,6 +248,18 @@ class SymmetryTable:
         if obj_id not in self.entries:
             raise UserError(f"object {obj_id} is not in the symmetry table, which has {_listed(self.entries)}")
         return self.entries[obj_id].canonical_map(self.scheme, self.allocentric, self.decimals)
+
+    def quasi_map(self, obj_id: int) -> CanonicalMap:
+        """The map that labels an object's poses as if it had its quasi-symmetry group.
+
+        Raises:
+            UserError: the table does not have the object, or no such group of it.
+        """
+        own = self.canonical_map(obj_id)
+        quasi = self.entries[obj_id].quasi
+        if quasi is None:
+            raise UserError(f"object {obj_id} has no quasi-symmetry group in the symmetry table")
+        return replace(own, group=quasi.group)
 
     def _described(self, entry: SymmetryEntry) -> dict[str, Any]:
         described = _described_group(entry.group)
