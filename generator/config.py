@@ -15,12 +15,14 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, ValidationError
 
+from synthetless import assets
 from synthetless.errors import UserError
 from synthetless.io.documents import parse_document, read_document, shown
 from synthetless.scenes.settings import SENSORS, Bounds, SceneSettings, SensorSettings, Settings
 from synthetless.scenes.spec import Intrinsics
 
 BUILTIN = "builtin"
+BUILTIN_MODELS = Path(assets.__file__).parent / "parts"
 SPLIT = "train_synthetless"
 """The folder of scenes, if a recipe names no other."""
 
@@ -244,3 +246,8 @@ def recipe_page() -> str:
         kind = setting.kind.replace("|", "\\|")
         lines.append(f"| `{setting.key}` | {kind} | `{json.dumps(setting.default)}` | {setting.description} |")
     return "\n".join(lines) + "\n"
+
+
+def models_folder(source: str) -> Path:
+    """The folder that a recipe's source of models stands for."""
+    return BUILTIN_MODELS if source == BUILTIN else Path(source)

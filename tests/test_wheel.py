@@ -86,7 +86,7 @@ def test_a_wheel_works_beside_folders_of_the_same_names(wheel: Path, tmp_path: P
     (home / "recipe.yaml").write_text("imges: 3\n")
     code = (
         "import synthetless, synthetless.scenes.spec, synthetless.symmetry\n"
-        "from synthetless.generation.sources import models_folder\n"
+        "from synthetless.config import models_folder\n"
         "from synthetless.io.models import load_models\n"
         "model = load_models(models_folder('builtin'), (1,))[1]\n"
         "print(synthetless.__path__[0], model.path, sep='\\n')\n"

@@ -62,6 +62,11 @@ class Rays:
         y = (np.arange(window.top, window.bottom) - camera.cy) / camera.fy
         return cls(window, x, y)
 
+    def every(self, step: int) -> Rays:
+        """Every step-th of them in both directions, as those of a smaller window."""
+        x, y = self.x[::step], self.y[::step]
+        return Rays(Window(0, 0, len(x), len(y)), x, y)
+
     @property
     def lengths(self) -> NDArray[np.float64]:
         """(h, w) distance from the camera to z = 1 along each ray."""

@@ -1,4 +1,4 @@
-"""Commands about labels: relabel, adopt, symmetries detect and show."""
+"""Commands about labels: relabel, adopt, ambiguity, symmetries detect and show."""
 
 from __future__ import annotations
 
@@ -54,6 +54,33 @@ def adopt_command(
     from synthetless.dataset.relabel import adopt
 
     say(adopt(dataset, models, symmetries, scheme))
+
+
+def ambiguity_command(
+    dataset: Annotated[Path, typer.Argument(help="Folder of a dataset that generate made, or that adopt labelled.")],
+    eps_mm: Annotated[
+        float | None,
+        typer.Option(metavar="E", help="Depths that differ by more are told apart. Default: what a pixel measures."),
+    ] = None,
+    what: Annotated[
+        Literal["depth", "normals", "silhouette"], typer.Option(help="What is compared; for colour images normals.")
+    ] = "depth",
+    models: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of its models, if they are not in the dataset.")
+    ] = None,
+    poses: Annotated[bool, typer.Option("--poses", help="Also write the poses themselves that look alike.")] = False,
+    workers: Workers = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the counts as JSON.")] = False,
+) -> None:
+    """Find which nearly symmetrical poses look alike in each image.
+
+    For objects with a quasi-symmetry group. Images are not looked at: poses and meshes decide. Called again, it goes on
+    where it was interrupted.
+    """
+    from synthetless.dataset.ambiguity import write_ambiguity
+
+    done = write_ambiguity(dataset, what, eps_mm, models, poses, workers)
+    say(json.dumps(asdict(done)) if as_json else done)
 
 
 def detect_command(

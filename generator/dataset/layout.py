@@ -21,6 +21,10 @@ SYMMETRIES_FILE = "symmetries.json"
 PENDING_FILE = ".symmetries.json"
 """While labels are being replaced: the symmetry table that the new ones are of."""
 CAMERA_FILE = "camera.json"
+AMBIGUITY_FILE = "ambiguity.json"
+"""What the scene folders' scene_gt_ambiguity.json are of."""
+PENDING_AMBIGUITY_FILE = ".ambiguity.json"
+"""The same while they are being made."""
 DRAFT_FOLDER = ".relabel.draft"
 """New labels, until all of them are made."""
 CARD_FILE = "README.md"
@@ -34,6 +38,7 @@ _MODELS_FOLDERS = (MODELS_FOLDER, "models_cad", "models_eval")
 _RESERVED = (
     DATASET_FILE,
     SYMMETRIES_FILE,
+    AMBIGUITY_FILE,
     CAMERA_FILE,
     CARD_FILE,
     SHEET_FILE,
@@ -113,6 +118,11 @@ class ScenePaths:
 
     root: Path
 
+    @property
+    def name(self) -> str:
+        """SPLIT/%06d."""
+        return f"{self.root.parent.name}/{self.root.name}"
+
     @classmethod
     def of(cls, dataset: Path, scene_id: int, split: str = SPLIT) -> ScenePaths:
         """The paths of a scene in a dataset folder."""
@@ -164,6 +174,10 @@ class ScenePaths:
         return self.root / "scene_gt_canonical.json"
 
     @property
+    def scene_gt_ambiguity(self) -> Path:
+        return self.root / "scene_gt_ambiguity.json"
+
+    @property
     def scene_spec(self) -> Path:
         return self.root / "scene_spec.jsonl"
 
@@ -208,7 +222,7 @@ def scene_folders(root: Path, having: Iterable[str]) -> list[ScenePaths]:
 
 def other_sensors(folder: Path) -> list[str]:
     """Ground truth of further sensors in a scene folder, such as scene_gt_cam1.json: BOP 2024 allows several."""
-    own = {"scene_gt_info.json", "scene_gt_coco.json", "scene_gt_canonical.json"}
+    own = {f"scene_gt_{what}.json" for what in ("info", "coco", "canonical", "ambiguity")}
     names = sorted(path.name for path in folder.glob("scene_gt_*.json") if path.name not in own)
     return [name for name in names if not name.startswith(("scene_gt_info_", "scene_gt_coco_"))]
 

@@ -10,6 +10,7 @@ JSON records that stand there (``read_entries``).
 
 from __future__ import annotations
 
+import hashlib
 import operator
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,6 +26,7 @@ from pydantic import ValidationError
 from synthetless.annotation.instances import Box
 from synthetless.config import Recipe
 from synthetless.dataset.layout import (
+    AMBIGUITY_FILE,
     DATASET_FILE,
     SYMMETRIES_FILE,
     ScenePaths,
@@ -33,6 +35,7 @@ from synthetless.dataset.layout import (
     scene_ids,
 )
 from synthetless.dataset.records import (
+    AmbiguityEntry,
     CameraEntry,
     CanonicalEntry,
     ForeignCameraEntry,
@@ -41,6 +44,7 @@ from synthetless.dataset.records import (
     GtEntry,
     GtInfoEntry,
     ImageSpec,
+    ambiguity_fault,
     read_scene_json,
     validated,
 )
@@ -98,6 +102,54 @@ class Visibility:
 
 
 @dataclass(frozen=True, eq=False)
+class QuasiLabel:
+    """Which nearly symmetrical poses the image cannot tell apart; see ``symmetry.ambiguity``.
+
+    Attributes:
+        R_m2c, t_m2c: (3, 3) and (3,) mm, canonical pose under the quasi-symmetry group: what is learned coarsely.
+        index, n_indices: the regressor that is responsible for it, and how many there are.
+        coset_true: the coset h G of the true pose among those of the exact group: it looks like R_m2c h.
+        alike: (k,) whether the image cannot tell each coset from the true one; the true one is among them.
+        pixels_apart: (k,) at how many pixels it can be told from it.
+        view_ambiguity: share of ``alike``.
+        eps_mm: depths that differ by more were told apart.
+        R_alike, t_alike: (M, 3, 3) and (M, 3) mm, all poses that look alike; None unless they were asked for.
+    """
+
+    R_m2c: Floats
+    t_m2c: Floats
+    index: int
+    n_indices: int
+    coset_true: int
+    alike: NDArray[np.bool_]
+    pixels_apart: Integers
+    view_ambiguity: float
+    eps_mm: float
+    R_alike: Floats | None = None
+    t_alike: Floats | None = None
+
+    @classmethod
+    def of(cls, entry: AmbiguityEntry) -> QuasiLabel:
+        """The label of an entry of scene_gt_ambiguity.json."""
+        alike = np.zeros(entry["n_cosets"], dtype=bool)
+        alike[entry["cosets_alike"]] = True
+        poses = np.array(entry["poses_alike"], dtype=np.float64).reshape(-1, 12) if "poses_alike" in entry else None
+        return cls(
+            np.array(entry["cam_R_m2c_quasi"], dtype=np.float64).reshape(3, 3),
+            np.array(entry["cam_t_m2c_quasi"], dtype=np.float64),
+            entry["quasi_index"],
+            entry["n_quasi_indices"],
+            entry["coset_true"],
+            alike,
+            np.array(entry["pixels_apart"], dtype=np.int64),
+            entry["view_ambiguity"],
+            entry["eps_mm"],
+            None if poses is None else poses[:, :9].reshape(-1, 3, 3),
+            None if poses is None else poses[:, 9:],
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class Instance:
     """An object in an image.
 
@@ -108,6 +160,8 @@ class Instance:
         t_m2c: (3,) true translation, millimetres.
         label: canonical pose and regressor; None if the dataset is not labelled.
         visibility: None if the scene folder has no scene_gt_info.json.
+        quasi: None if the object has no quasi-symmetry group, or ``synthetless ambiguity`` has not judged the dataset
+            as it is now.
     """
 
     paths: ScenePaths
@@ -118,6 +172,7 @@ class Instance:
     t_m2c: Floats
     label: Label | None
     visibility: Visibility | None
+    quasi: QuasiLabel | None = None
 
     def mask(self) -> NDArray[np.bool_]:
         """(H, W) whole silhouette inside the image, hidden parts included; a UserError without a readable file."""
@@ -313,6 +368,7 @@ class Scene:
         R_w2c, t_w2c: (M, 3, 3), (M, 3) mm, world to camera; None if the dataset does not say.
         labels: of the N instances; None without scene_gt_canonical.json.
         visibility: of the N instances; None without scene_gt_info.json.
+        ambiguity: records of the N instances, as ``Instance.quasi`` has them.
     """
 
     paths: ScenePaths
@@ -322,6 +378,7 @@ class Scene:
     t_w2c: Floats | None
     labels: Labels | None
     visibility: Visibilities | None
+    ambiguity: tuple[AmbiguityEntry | None, ...]
 
     @classmethod
     def read(cls, paths: ScenePaths) -> Scene:
@@ -361,6 +418,7 @@ class Scene:
             _column(cameras, "cam_t_w2c", in_camera, 3) if placed else None,
             Labels.of(canonical, in_canonical) if paths.scene_gt_canonical.exists() else None,
             Visibilities.of(info, in_info) if paths.scene_gt_info.exists() else None,
+            tuple(entry for image in entries for entry in image.gt_ambiguity or [None] * len(image.gt)),
         )
 
     def __post_init__(self) -> None:
@@ -399,6 +457,7 @@ class Scene:
         )
 
     def _instance(self, im_id: int, gt_id: int, row: int) -> Instance:
+        ambiguity = self.ambiguity[row]
         return Instance(
             self.paths,
             im_id,
@@ -408,6 +467,7 @@ class Scene:
             self.poses.t_m2c[row].copy(),
             None if self.labels is None else self.labels.row(row),
             None if self.visibility is None else self.visibility.row(row),
+            None if ambiguity is None else QuasiLabel.of(ambiguity),
         )
 
 
@@ -530,6 +590,7 @@ class ImageEntries:
         im_id: the image.
         camera: its entry in scene_camera.json.
         gt, gt_info, gt_canonical: its entries in scene_gt.json, scene_gt_info.json and scene_gt_canonical.json.
+        gt_ambiguity: those in scene_gt_ambiguity.json; none unless the file is of the dataset as it is now.
     """
 
     im_id: int
@@ -537,6 +598,7 @@ class ImageEntries:
     gt: list[GtEntry]
     gt_info: list[GtInfoEntry]
     gt_canonical: list[CanonicalEntry]
+    gt_ambiguity: list[AmbiguityEntry | None]
 
 
 def read_entries(paths: ScenePaths) -> list[ImageEntries]:
@@ -564,13 +626,53 @@ def _read_entries(paths: ScenePaths, partly: bool = False) -> list[ImageEntries]
         {} if partly and not path.exists() else _matching(path, paths.scene_gt, gts)
         for path in (paths.scene_gt_info, paths.scene_gt_canonical)
     )
+    ambiguity = read_ambiguity(paths, gts)
     if cameras.keys() != gts.keys():
         image = min(cameras.keys() ^ gts.keys())
         raise UserError(f"{paths.root}: image {image} is in only one of scene_camera.json and scene_gt.json")
     return [
-        ImageEntries(im_id, cameras[im_id], gt, info.get(im_id, []), canonical.get(im_id, []))
+        ImageEntries(im_id, cameras[im_id], gt, info.get(im_id, []), canonical.get(im_id, []), ambiguity.get(im_id, []))
         for im_id, gt in gts.items()
     ]
+
+
+def read_ambiguity(paths: ScenePaths, gts: Mapping[int, Sequence[Any]]) -> dict[int, list[AmbiguityEntry | None]]:
+    """Entries of scene_gt_ambiguity.json by image id; none unless the file is of the dataset as it is now.
+
+    Args:
+        paths: a scene folder.
+        gts: content of its scene_gt.json.
+
+    Raises:
+        UserError: the file, or one that says what it is of, is damaged.
+    """
+    path = paths.scene_gt_ambiguity
+    if not path.exists() or not is_ambiguity_current(paths):
+        return {}
+    content = _matching(path, paths.scene_gt, gts)
+    validated(dict[int, list[AmbiguityEntry | None]], content, path)
+    for im_id, entries in content.items():
+        for gt_id, entry in enumerate(entries):
+            if entry is not None and (fault := ambiguity_fault(entry)):
+                raise UserError(f"{path}: image {im_id}, instance {gt_id}: {fault}")
+    return content
+
+
+def is_ambiguity_current(paths: ScenePaths) -> bool:
+    """Whether a scene folder's scene_gt_ambiguity.json is of the symmetries and poses that there are now."""
+    root = paths.root.parents[1]
+    if not (root / AMBIGUITY_FILE).exists() or not (root / SYMMETRIES_FILE).exists():
+        return False
+    stamp = read_json(root / AMBIGUITY_FILE)
+    scenes = stamp.get("scenes")
+    stated = scenes.get(paths.name) if isinstance(scenes, dict) else None
+    return stamp.get("symmetries") == SymmetryTable.read(root / SYMMETRIES_FILE).digest() and stated == digest(paths)
+
+
+def digest(paths: ScenePaths) -> str:
+    """SHA-256 of what a scene folder records of its bodies and cameras."""
+    files = [path for path in (paths.scene_gt, paths.scene_camera, paths.scene_spec) if path.exists()]
+    return hashlib.sha256(b"\0".join(read_bytes(path) for path in files)).hexdigest()
 
 
 def read_specs(paths: ScenePaths) -> dict[int, ImageSpec]:

@@ -41,6 +41,8 @@ Entry = dict[str, Any]
 ModelInfo = Mapping[str, Any]
 """An object's entry in models_info.json."""
 BoxList = Annotated[list[int], Field(min_length=4, max_length=4)]
+PoseList = Annotated[list[Number], Field(min_length=12, max_length=12)]
+"""R_m2c row by row, and t_m2c."""
 Point = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
@@ -86,6 +88,27 @@ class CanonicalEntry(TypedDict):
     n_regressors: Annotated[int, Field(ge=1)]
     discontinuity_margin_deg: NotNegative
     bbox3d_corners_2d: Annotated[list[Point], Field(min_length=8, max_length=8)]
+
+
+@with_config(_EXACT)
+class AmbiguityEntry(TypedDict):
+    """An instance in scene_gt_ambiguity.json: which cosets of its quasi-symmetry group the image cannot tell apart.
+
+    ``symmetry.ambiguity`` says what the numbers mean. Instances without such a group have null in their place.
+    """
+
+    obj_id: Count
+    cam_R_m2c_quasi: Matrix
+    cam_t_m2c_quasi: Vector
+    quasi_index: Count
+    n_quasi_indices: Annotated[int, Field(ge=1)]
+    n_cosets: Annotated[int, Field(ge=2)]
+    coset_true: Count
+    cosets_alike: Annotated[list[Count], Field(min_length=1)]
+    pixels_apart: list[Count]
+    view_ambiguity: Annotated[float, Field(gt=0, le=1)]
+    eps_mm: Positive
+    poses_alike: NotRequired[list[PoseList]]
 
 
 @with_config(_OPEN)
@@ -285,6 +308,21 @@ def spec_entry(spec: ImageSpec) -> dict[str, Any]:
     if spec.sensor is None:
         del entry["sensor"]
     return entry
+
+
+def ambiguity_fault(entry: AmbiguityEntry) -> str | None:
+    """Why an entry of scene_gt_ambiguity.json contradicts itself, if it does."""
+    n, true, alike, apart = entry["n_cosets"], entry["coset_true"], entry["cosets_alike"], entry["pixels_apart"]
+    if len(apart) != n:
+        return f"pixels_apart has {len(apart)} numbers; there are {n} cosets"
+    if not 0 <= true < n or apart[true] != 0:
+        return f"coset_true is {true}, which is not one of the {n} cosets with 0 pixels apart"
+    most = max((apart[number] for number in alike if number < n), default=0)
+    if alike != [number for number, count in enumerate(apart) if count <= most]:
+        return f"cosets_alike is {alike}, not the cosets of the fewest pixels apart, ascending"
+    if abs(entry["view_ambiguity"] - len(alike) / n) > 1e-9:
+        return f"view_ambiguity is {entry['view_ambiguity']}; {len(alike)} of {n} cosets are alike"
+    return None
 
 
 def write_scene_json(path: Path, entries: Mapping[int, Any]) -> None:

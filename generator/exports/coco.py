@@ -91,7 +91,21 @@ class ExportedImage(TypedDict):
     license: NotRequired[int]
 
 
-class ExportedAnnotation(TypedDict):
+class _QuasiFields(TypedDict, total=False):
+    """Of scene_gt_ambiguity.json, where the object has a quasi-symmetry group and ``ambiguity`` judged the image."""
+
+    cam_R_m2c_quasi: list[float]
+    cam_t_m2c_quasi: list[float]
+    quasi_index: int
+    n_quasi_indices: int
+    n_cosets: int
+    coset_true: int
+    cosets_alike: list[int]
+    pixels_apart: list[int]
+    view_ambiguity: float
+
+
+class ExportedAnnotation(_QuasiFields):
     """A visible instance in it: what COCO asks for, which instance it is, its true pose and its label."""
 
     id: int
@@ -240,7 +254,8 @@ def _annotation(
     gt, label = labels.gt[gt_id], labels.gt_canonical[gt_id]
     corners = label["bbox3d_corners_2d"]
     rle = compressed_rle(annotation["segmentation"])
-    return {
+    ambiguity: Any = (labels.gt_ambiguity[gt_id] if labels.gt_ambiguity else None) or {}
+    exported: ExportedAnnotation = {
         "id": number,
         "image_id": image_id,
         "category_id": annotation["category_id"],
@@ -261,6 +276,8 @@ def _annotation(
         "n_regressors": label["n_regressors"],
         "regressor_index": label["regressor_index"],
     }
+    quasi: Any = {key: value for key, value in ambiguity.items() if key in _QuasiFields.__annotations__}
+    return exported | quasi  # type: ignore[no-any-return]
 
 
 def compressed_rle(segmentation: _Segmentation) -> _Segmentation:

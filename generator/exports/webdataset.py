@@ -1,8 +1,8 @@
 """BOP's webdataset: tar shards of a split, read front to back without seeking.
 
 Format: https://github.com/thodan/bop_toolkit/blob/master/bop_toolkit_lib/dataset/bop_webdataset.py, and beside its
-members one more, ``gt_canonical.json``. Encoded images are copied, never decoded; the same dataset and seed give the
-same bytes.
+members ``gt_canonical.json`` and, where there is one, ``gt_ambiguity.json``. Encoded images are copied, never decoded;
+the same dataset and seed give the same bytes.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from synthetless.dataset.labels import refuse_half_labelled
 from synthetless.dataset.layout import (
+    AMBIGUITY_FILE,
     CARD_FILE,
     DATASET_FILE,
     SYMMETRIES_FILE,
@@ -32,14 +33,23 @@ from synthetless.dataset.layout import (
 from synthetless.dataset.reader import ImageEntries, read_entries
 from synthetless.dataset.records import RunLengths, uncompressed_rle
 from synthetless.errors import UserError
-from synthetless.io.files import atomic_file, atomic_folder, atomic_write, read_bytes, remove_drafts, write_json
+from synthetless.io.files import (
+    atomic_file,
+    atomic_folder,
+    atomic_write,
+    read_bytes,
+    remove_drafts,
+    remove_file,
+    write_json,
+)
 from synthetless.io.images import decode_mask
 from synthetless.io.parallel import processes
 
 MAX_IMAGES_PER_SHARD = 1000
 """BOP's limit."""
 KEYS_FILE = "key_to_shard.json"
-_COMPANIONS = (DATASET_FILE, SYMMETRIES_FILE, CARD_FILE)
+_AMBIGUITY = "gt_ambiguity.json"
+_COMPANIONS = (DATASET_FILE, SYMMETRIES_FILE, AMBIGUITY_FILE, CARD_FILE)
 """Files of the dataset folder that say what the labels mean, copied beside the shards."""
 
 Members = dict[str, bytes]
@@ -160,12 +170,13 @@ def _richest_first(images: list[ShardImage]) -> list[ShardImage]:
 
 
 def _label_members(labels: ImageEntries) -> Members:
-    return {
+    members = {
         "camera.json": _json(labels.camera),
         "gt.json": _json(labels.gt),
         "gt_canonical.json": _json(labels.gt_canonical),
         "gt_info.json": _json(labels.gt_info),
     }
+    return members | ({_AMBIGUITY: _json(labels.gt_ambiguity)} if labels.gt_ambiguity else {})
 
 
 def _run(function: Callable[[ShardTask], int], tasks: Sequence[ShardTask], workers: int | None) -> None:
@@ -187,7 +198,8 @@ def _write_shard(task: ShardTask) -> int:
 def _relabel_shard(task: ShardTask) -> int:
     path, images = task
     labels = {image.key: image.labels for image in images}
-    _write_tar(path, ((key, {**members, **labels[key]}) for key, members in _read_tar(path)))
+    kept = ((key, {name: data for name, data in of.items() if name != _AMBIGUITY}) for key, of in _read_tar(path))
+    _write_tar(path, ((key, {**members, **labels[key]}) for key, members in kept))
     return len(images)
 
 
@@ -265,7 +277,9 @@ def _key(member_name: str) -> str:
 
 def _finish(dataset: Path, folder: Path, key_to_shard: dict[str, int]) -> dict[str, int]:
     for name in _COMPANIONS:
-        if (dataset / name).exists():
+        if not (dataset / name).exists():
+            remove_file(folder / name)
+        else:
             atomic_write(folder / name, read_bytes(dataset / name))
     write_json(folder / KEYS_FILE, dict(sorted(key_to_shard.items())))
     return key_to_shard

@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetless.config import BUILTIN, Recipe
+from synthetless.config import BUILTIN, Recipe, models_folder
 from synthetless.dataset.layout import MODELS_FOLDER, ScenePaths
 from synthetless.dataset.reader import read_recipe, read_specs
 from synthetless.errors import UserError
-from synthetless.generation.sources import models_folder
 from synthetless.io.color import picture
 from synthetless.io.models import ObjectModel, load_models
 from synthetless.scenes.render import BlenderSession

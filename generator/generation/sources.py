@@ -9,15 +9,12 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from synthetless import assets
-from synthetless.config import BUILTIN, Recipe, RecipeError
+from synthetless.config import BUILTIN, Recipe, RecipeError, models_folder
 from synthetless.errors import UserError
 from synthetless.io.models import ObjectModel, load_models
 from synthetless.scenes.sampling import Catalogue
 from synthetless.scenes.textures import list_photos, load_photo
 from synthetless.symmetry import SymmetryGroup
-
-BUILTIN_MODELS = Path(assets.__file__).parent / "parts"
 
 
 @dataclass(frozen=True)
@@ -85,11 +82,6 @@ def check_photos(sources: Sources) -> None:
     if sources.photos_folder is not None:
         for name in tqdm(sources.photos, desc="checking textures", unit="file", disable=None, leave=False):
             load_photo(sources.photos_folder, name)
-
-
-def models_folder(source: str) -> Path:
-    """The folder that a recipe's source of models stands for."""
-    return BUILTIN_MODELS if source == BUILTIN else Path(source)
 
 
 def _check_symmetries(obj_id: int, model: ObjectModel) -> None:

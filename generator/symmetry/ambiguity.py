@@ -38,6 +38,8 @@ FINEST_MM = 0.3
 THETA_DEG = 10.0
 """Normals that differ by more can be told apart by their shading."""
 
+_STEP, _MANY = 3, 10
+"""So many of every third pixel in both directions spare looking at all of them."""
 _NEIGHBOURS = np.ones((3, 3), np.uint8)
 
 Mask = NDArray[np.bool_]
@@ -197,19 +199,28 @@ def pixels_apart(true: View, other: View, occluder_mm: ArrayLike, what: What, ep
         what: what is compared.
         eps_mm: of depths.
     """
-    a, b = true.depth_mm, other.depth_mm
-    differs = _unexplained(a, b, eps_mm) if what == "depth" else _unexplained(_flat(a), _flat(b), eps_mm)
+    differs = _unexplained(true, other, what, eps_mm) | _unexplained(other, true, what, eps_mm)
+    return int(np.count_nonzero(differs & _in_front(true, other, np.asarray(occluder_mm))))
+
+
+def _in_front(true: View, other: View, occluder_mm: Floats) -> Mask:
+    visible: Mask = occluder_mm > np.minimum(true.depth_mm, other.depth_mm)
+    return visible
+
+
+def _unexplained(view: View, by: View, what: What, eps_mm: float, step: int = 1) -> Mask:
+    """Where a view shows what another one shows neither there nor at a neighbour; ``view`` has every step-th pixel."""
+    depth, of = view.depth_mm, by.depth_mm
+    if what != "depth":
+        depth, of = _flat(depth), _flat(of)
+    low, high = (bound[::step, ::step] for bound in _range(of))
+    apart: Mask = (depth < low - eps_mm) | (depth > high + eps_mm)
     if what == "normals":
-        if true.normals is None or other.normals is None:
+        if view.normals is None or by.normals is None:
             raise ValueError("normals are to be compared, and there are none")
-        differs |= _bent(true.normals, other.normals, a, b)
-    return int(np.count_nonzero(differs & (np.asarray(occluder_mm) > np.minimum(a, b))))
-
-
-def _unexplained(a: Floats, b: Floats, eps_mm: float) -> Mask:
-    (low_a, high_a), (low_b, high_b) = _range(a), _range(b)
-    first = (a < low_b - eps_mm) | (a > high_b + eps_mm)
-    return np.asarray(first | (b < low_a - eps_mm) | (b > high_a + eps_mm))
+        both = np.isfinite(depth) & np.isfinite(of[::step, ::step])
+        apart |= both & _unlike(view.normals, by.normals, step)
+    return apart
 
 
 def _range(depth_mm: Floats) -> tuple[Floats, Floats]:
@@ -221,21 +232,17 @@ def _flat(depth_mm: Floats) -> Floats:
     return np.where(np.isfinite(depth_mm), 0.0, np.inf)
 
 
-def _bent(a: Floats, b: Floats, depth_a: Floats, depth_b: Floats) -> Mask:
-    """Where both are hit, and none of the neighbours of one has a normal like that of the other."""
-    both = np.isfinite(depth_a) & np.isfinite(depth_b)
-    unlike = _unlike(a, b) | _unlike(b, a)
-    return both & unlike
-
-
-def _unlike(a: Floats, b: Floats) -> Mask:
-    h, w = a.shape[:2]
+def _unlike(a: Floats, b: Floats, step: int) -> Mask:
+    """Where none of the neighbours in ``b`` has a normal like that of ``a``."""
+    h, w = b.shape[:2]
     around = np.pad(b, ((1, 1), (1, 1), (0, 0)))
-    cosine = np.full((h, w), -1.0)
+    cosine = np.full(a.shape[:2], -1.0)
     for i in range(3):
         for j in range(3):
-            np.maximum(cosine, np.einsum("ijk,ijk->ij", a, around[i : i + h, j : j + w]), out=cosine)
-    return np.asarray(cosine < math.cos(math.radians(THETA_DEG)))
+            neighbour = around[i : i + h : step, j : j + w : step]
+            np.maximum(cosine, np.einsum("ijk,ijk->ij", a, neighbour), out=cosine)
+    unlike: Mask = cosine < math.cos(math.radians(THETA_DEG))
+    return unlike
 
 
 # Images
@@ -247,7 +254,8 @@ class Ambiguity:
 
     Attributes:
         coset_true: the coset of its pose.
-        pixels_apart: (k,) at how many pixels each coset can be told from it; 0 at the true one.
+        pixels_apart: (k,) at how many pixels each coset can be told from it; 0 at the true one. Large numbers are
+            estimated from every third pixel.
         eps_mm: how finely depths were compared.
         R_m2c, t_m2c: (k, 3, 3) and (k, 3) mm, the pose of each coset.
     """
@@ -304,9 +312,19 @@ def see(
         seen = _view(surface, rays, resolution.what)
         for number, body in enumerate(bodies):
             if number != true:
-                view = _view(body, rays, resolution.what)
-                apart[number] = pixels_apart(seen, view, occluder_mm, resolution.what, eps_mm)
+                apart[number] = _count_apart(seen, body, rays, occluder_mm, resolution.what, eps_mm)
     return Ambiguity(true, apart, eps_mm, R, t)
+
+
+def _count_apart(seen: View, body: PosedSurface, rays: Rays, occluder_mm: Floats, what: What, eps_mm: float) -> int:
+    """``pixels_apart``; where every third pixel shows that there are many, what those tell."""
+    view = _view(body, rays.every(_STEP), what)
+    thin = View(seen.depth_mm[::_STEP, ::_STEP])
+    differs = _unexplained(view, seen, what, eps_mm, _STEP) & _in_front(thin, view, occluder_mm[::_STEP, ::_STEP])
+    count = int(np.count_nonzero(differs))
+    if count >= _MANY:
+        return count * _STEP**2
+    return pixels_apart(seen, _view(body, rays, what), occluder_mm, what, eps_mm)
 
 
 def nearest_depth_mm(bodies: Sequence[PosedSurface], plane: Plane | None, camera: Intrinsics, rays: Rays) -> Floats:

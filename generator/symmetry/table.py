@@ -127,6 +127,9 @@ class SymmetryTable:
         ordered = {obj_id: self.entries[obj_id] for obj_id in sorted(self.entries)}
         object.__setattr__(self, "entries", MappingProxyType(ordered))
 
+    def __reduce__(self) -> tuple[type[SymmetryTable], tuple[Any, ...]]:
+        return SymmetryTable, (dict(self.entries), self.scheme, self.allocentric, self.decimals)
+
     @classmethod
     def from_models_info(cls, models_info: object, scheme: Scheme = "pitteri2019", allocentric: bool = False) -> Self:
         """The table of the groups that BOP's `models_info.json` declares (keys: object ids as int or str).

@@ -12,7 +12,7 @@ from typing import Any
 
 from pycocotools import mask as coco_mask
 
-from synthetless.dataset.layout import DATASET_FILE, SYMMETRIES_FILE, ScenePaths
+from synthetless.dataset.layout import AMBIGUITY_FILE, DATASET_FILE, SYMMETRIES_FILE, ScenePaths
 from synthetless.dataset.records import uncompressed_rle
 from synthetless.exports.coco import export_coco
 from synthetless.exports.webdataset import KEYS_FILE
@@ -100,8 +100,10 @@ class ShardsTask:
 
 def check_companions(source: Source, folder: Path) -> Iterator[Finding]:
     """The copies of dataset.json and symmetries.json."""
-    for name in (DATASET_FILE, SYMMETRIES_FILE):
+    for name in (DATASET_FILE, SYMMETRIES_FILE, AMBIGUITY_FILE):
         path, original = folder / name, source.root / name
+        if name == AMBIGUITY_FILE and not path.exists() and not original.exists():
+            continue
         if not path.exists():
             yield Finding("export", path, "not there; export writes it beside the shards")
         elif original.exists() and read_bytes(path) != read_bytes(original):
@@ -169,6 +171,7 @@ def _contents(scene: SceneRecords, im_id: int) -> dict[str, Any]:
         "gt.json": scene.gt,
         "gt_canonical.json": scene.canonical,
         "gt_info.json": scene.gt_info,
+        "gt_ambiguity.json": scene.ambiguity if scene.is_ambiguity_current else {},
     }
     return {name: content[im_id] for name, content in sources.items() if im_id in content}
 

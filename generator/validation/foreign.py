@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from synthetless.dataset.labels import is_half_labelled
 from synthetless.dataset.layout import (
+    AMBIGUITY_FILE,
     DATASET_FILE,
     SYMMETRIES_FILE,
     ScenePaths,
@@ -36,6 +37,7 @@ from synthetless.io.files import read_bytes
 from synthetless.io.images import DamagedImageError, decode_depth, decode_mask, decode_rgb
 from synthetless.io.models import INFO_FILE
 from synthetless.symmetry.quaternions import MAX_DEFECT
+from synthetless.validation.ambiguity import check_ambiguity
 from synthetless.validation.images import (
     AS_RENDERED,
     InstanceMasks,
@@ -46,7 +48,7 @@ from synthetless.validation.images import (
     container_fault,
 )
 from synthetless.validation.recompute import check_labels
-from synthetless.validation.records import Place, SceneRecords, check_instances, check_poses, read_entries
+from synthetless.validation.records import Place, SceneRecords, check_instances, check_poses, read_entries, read_judged
 from synthetless.validation.report import Finding, Tally
 from synthetless.validation.structure import read_infos, read_table
 
@@ -139,6 +141,7 @@ def check_foreign_scene(task: ForeignTask) -> ForeignResult:
         objects = ", ".join(map(str, stale))
         message = f"labels of object {objects} are of other symmetries than {SYMMETRIES_FILE}, or boxes; run adopt"
         tally.add([Finding("stale", paths.scene_gt_canonical, message)])
+    tally.add(check_ambiguity(foreign.root, scene))
     files = SceneFiles.list(scene)
     tally.add(files.check_folders(scene))
     for im_id in sorted(scene.gt.keys() | files.image_ids):
@@ -150,7 +153,7 @@ def check_foreign_scene(task: ForeignTask) -> ForeignResult:
 def notes_on(foreign: Foreign, results: Sequence[ForeignResult]) -> Iterator[str]:
     """What was not checked, and why."""
     splits = {scene.root.parent.name for scene in foreign.scenes}
-    beside = {path.name for path in foreign.root.iterdir()} - splits - {SYMMETRIES_FILE, "models"}
+    beside = {path.name for path in foreign.root.iterdir()} - splits - {SYMMETRIES_FILE, AMBIGUITY_FILE, "models"}
     names = sorted(name for name in beside if not name.startswith("."))
     names += sorted(set[str]().union(*(result.unchecked for result in results)))
     more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
@@ -173,6 +176,7 @@ def notes_on(foreign: Foreign, results: Sequence[ForeignResult]) -> Iterator[str
 
 def _read_records(paths: ScenePaths) -> SceneRecords:
     findings: list[Finding] = []
+    ambiguity, is_current = read_judged(paths, findings)
     return SceneRecords(
         paths,
         camera=_read_cameras(paths.scene_camera, findings),
@@ -181,6 +185,8 @@ def _read_records(paths: ScenePaths) -> SceneRecords:
         if paths.scene_gt_info.exists()
         else {},
         canonical=read_entries(paths.scene_gt_canonical, list[CanonicalEntry], findings),
+        ambiguity=ambiguity,
+        is_ambiguity_current=is_current,
         findings=findings,
     )
 

@@ -11,8 +11,10 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetless.dataset.layout import RECORDS_FOLDER, ImagePlan, ScenePaths
+from synthetless.dataset.layout import AMBIGUITY_FILE, RECORDS_FOLDER, ImagePlan, ScenePaths
+from synthetless.dataset.reader import is_ambiguity_current
 from synthetless.dataset.records import (
+    AmbiguityEntry,
     CameraEntry,
     CanonicalEntry,
     CocoAnnotation,
@@ -20,6 +22,7 @@ from synthetless.dataset.records import (
     GtEntry,
     GtInfoEntry,
     ImageSpec,
+    ambiguity_fault,
     coco_image,
     read_scene_json,
     schema,
@@ -42,6 +45,8 @@ class SceneRecords:
     Attributes:
         paths: the files.
         camera, gt, gt_info, canonical: BOP's entries and the labels.
+        ambiguity: entries of scene_gt_ambiguity.json, where there is one.
+        is_ambiguity_current: whether that file is of the symmetries and poses that there are now.
         coco: content of scene_gt_coco.json; None if it cannot be used. Images and annotations of the wrong form are
             left out.
         spec: the recorded images.
@@ -54,6 +59,8 @@ class SceneRecords:
     gt: dict[int, list[GtEntry]] = field(default_factory=dict)
     gt_info: dict[int, list[GtInfoEntry]] = field(default_factory=dict)
     canonical: dict[int, list[CanonicalEntry]] = field(default_factory=dict)
+    ambiguity: dict[int, list[AmbiguityEntry | None]] = field(default_factory=dict)
+    is_ambiguity_current: bool = False
     coco: CocoFile | None = None
     spec: dict[int, ImageSpec] = field(default_factory=dict)
     spec_json: dict[int, Any] = field(default_factory=dict)
@@ -70,6 +77,7 @@ class SceneRecords:
             read_entries(paths.scene_gt, list[GtEntry], findings),
             read_entries(paths.scene_gt_info, list[GtInfoEntry], findings),
             read_entries(paths.scene_gt_canonical, list[CanonicalEntry], findings),
+            *read_judged(paths, findings),
             _read_coco(paths.scene_gt_coco, findings),
             _read_spec(paths.scene_spec, spec_json, findings),
             spec_json,
@@ -80,7 +88,8 @@ class SceneRecords:
     def json_files(self) -> set[Path]:
         """Every JSON file of a scene folder."""
         p = self.paths
-        return {p.scene_camera, p.scene_gt, p.scene_gt_info, p.scene_gt_coco, p.scene_gt_canonical, p.scene_spec}
+        labels = {p.scene_gt_canonical, p.scene_gt_ambiguity}
+        return {p.scene_camera, p.scene_gt, p.scene_gt_info, p.scene_gt_coco, p.scene_spec, *labels}
 
     def is_readable(self, path: Path) -> bool:
         """Whether a file, as a whole, has the right form."""
@@ -115,6 +124,27 @@ def read_entries(path: Path, form: Any, findings: list[Finding]) -> dict[int, An
         if not faults:
             good[im_id] = entry
     return good
+
+
+def read_judged(paths: ScenePaths, findings: list[Finding]) -> tuple[dict[int, list[AmbiguityEntry | None]], bool]:
+    """Entries of scene_gt_ambiguity.json, if there is one, and whether it is of the dataset as it is now.
+
+    ``findings`` gets what is wrong with it.
+    """
+    path = paths.scene_gt_ambiguity
+    if not path.exists():
+        return {}, False
+    try:
+        current = is_ambiguity_current(paths)
+    except ValueError as error:
+        findings.append(unusable(paths.root.parents[1] / AMBIGUITY_FILE, error))
+        current = False
+    entries = read_entries(path, list[AmbiguityEntry | None], findings)
+    for im_id, of_image in entries.items():
+        for gt_id, entry in enumerate(of_image):
+            if entry is not None and (fault := ambiguity_fault(entry)):
+                findings.append(Finding("ambiguity", path, fault, im_id, gt_id))
+    return entries, current
 
 
 def _read_coco(path: Path, findings: list[Finding]) -> CocoFile | None:
@@ -190,6 +220,7 @@ def check_instances(scene: SceneRecords) -> Iterator[Finding]:
     lists: list[tuple[Path, Mapping[int, Sequence[Any]]]] = [
         (scene.paths.scene_gt_info, scene.gt_info),
         (scene.paths.scene_gt_canonical, scene.canonical),
+        (scene.paths.scene_gt_ambiguity, scene.ambiguity if scene.is_ambiguity_current else {}),
     ]
     for path, content in lists:
         for im_id in sorted(scene.gt.keys() & content.keys()):
@@ -199,7 +230,7 @@ def check_instances(scene: SceneRecords) -> Iterator[Finding]:
                 yield Finding("ids", path, message, im_id)
                 continue
             for gt_id, (pose, other) in enumerate(zip(gt, others, strict=True)):
-                if other.get("obj_id", pose["obj_id"]) != pose["obj_id"]:
+                if other is not None and other.get("obj_id", pose["obj_id"]) != pose["obj_id"]:
                     message = f"is of object {other['obj_id']}; scene_gt.json has {pose['obj_id']}"
                     yield Finding("ids", path, message, im_id, gt_id)
 

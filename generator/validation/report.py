@@ -28,6 +28,7 @@ Kind = Literal[
     "geometry",  # normals and object coordinates against recomputed ones
     "coco",  # scene_gt_coco.json
     "canonical",  # labels that do not follow from poses and symmetries
+    "ambiguity",  # scene_gt_ambiguity.json: what contradicts itself, or does not follow from poses and meshes
     "stale",  # labels of other symmetries
     "export",  # an export that differs from its source
 ]

@@ -13,6 +13,7 @@ from synthetless.dataset.layout import DATASET_FILE, ImagePlan
 from synthetless.dataset.store import DatasetStore
 from synthetless.errors import UserError
 from synthetless.io.parallel import Map, processes, watched
+from synthetless.validation.ambiguity import check_ambiguity
 from synthetless.validation.exports import (
     Shards,
     ShardsTask,
@@ -228,6 +229,7 @@ def check_scene(task: SceneTask) -> SceneResult:
         tally.add(check_stored(store, task.scene_id, scene, {plan.im_id for plan in task.plans}))
         faults, stale = check_labels(source.symmetries, source.infos, scene, valid)
         tally.add(faults)
+        tally.add(check_ambiguity(source.root, scene))
         tally.add(unmatched)
         image_ids, instances = tuple(scene.gt), sum(len(gt) for gt in scene.gt.values())
     recomputed = skipped = 0

@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from synthetless.config import Recipe
+from synthetless.config import Recipe, models_folder
 from synthetless.dataset.labels import is_half_labelled
 from synthetless.dataset.layout import (
     CAMERA_FILE,
@@ -25,7 +25,6 @@ from synthetless.dataset.layout import (
     plan_image,
 )
 from synthetless.dataset.records import CameraFile, Count, ModelEntry, ModelInfo, camera_json, schema_faults
-from synthetless.generation.sources import models_folder
 from synthetless.io.files import read_bytes, read_json
 from synthetless.io.models import INFO_FILE, ObjectModel, load_models, read_models_info
 from synthetless.scenes.spec import Role
