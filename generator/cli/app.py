@@ -11,6 +11,7 @@ from synthetless.cli import data as exchanging
 from synthetless.cli import generate as making
 from synthetless.cli import inspect as looking
 from synthetless.cli import labels as labelling
+from synthetless.cli import learning
 from synthetless.cli.generate import EXIT_WRONG_REQUEST
 from synthetless.errors import UserError
 from synthetless.scenes.blender import BlenderError
@@ -38,6 +39,7 @@ app.command("relabel")(labelling.relabel_command)
 app.command("adopt")(labelling.adopt_command)
 app.command("render")(making.render_command)
 app.command("redo")(making.redo_command)
+app.command("score")(learning.score_command)
 app.add_typer(export, name="export")
 export.command("coco")(exchanging.coco_command)
 export.command("webdataset")(exchanging.webdataset_command)
