@@ -15,7 +15,7 @@ from pathlib import Path
 from benchmarks import ROOT, default_models, keep
 from synthetless.io.files import atomic_write
 from synthetless.io.parallel import usable_cores
-from synthetless.symmetry.detection import Detected, DetectedFolder, DetectedObject, Finding, detect_folder
+from synthetless.symmetry.detection import Detected, DetectedFolder, DetectedObject, GroupFit, detect_folder
 from synthetless.symmetry.detection.report import axis_text
 
 PAGE = ROOT / "docs" / "symmetry_tless.md"
@@ -92,7 +92,7 @@ def _conclusion(detected: DetectedFolder) -> str:
     """What the table shows, in numbers that follow from it."""
     objects = [o.detected for o in detected.objects if o.detected.declared is not None]
     agreeing = [o.obj_id for o in detected.objects if _agrees(o.detected, o.detected.answer)]
-    costs = sorted(100 * f.residual.max_mm / o.diameter_mm for o in objects for f in o.findings)
+    costs = sorted(100 * f.residual.max_mm / o.diameter_mm for o in objects for f in o.fits)
     best = max(costs, key=lambda percent: _n_agreeing(objects, percent))
     return CONCLUSION.format(
         tolerance=detected.tolerance_percent,
@@ -108,17 +108,17 @@ def _n_agreeing(objects: list[Detected], percent: float) -> int:
     return sum(_agrees(o, o.answer_at(percent / 100 * o.diameter_mm * (1 + 1e-9))) for o in objects)
 
 
-def _agrees(found: Detected, answer: Finding) -> bool:
+def _agrees(found: Detected, answer: GroupFit) -> bool:
     return found.declared is not None and answer.group.name == found.declared.group.name
 
 
-def _named(finding: Finding) -> str:
-    axis = finding.group.axis
-    return finding.group.name if axis is None else f"{finding.group.name} about {axis_text(axis)}"
+def _named(fit: GroupFit) -> str:
+    axis = fit.group.axis
+    return fit.group.name if axis is None else f"{fit.group.name} about {axis_text(axis)}"
 
 
-def _percent(finding: Finding, found: Detected) -> str:
-    return f"{100 * finding.residual.max_mm / found.diameter_mm:.2f}"
+def _percent(fit: GroupFit, found: Detected) -> str:
+    return f"{100 * fit.residual.max_mm / found.diameter_mm:.2f}"
 
 
 def _cpu_s() -> float:

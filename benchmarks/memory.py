@@ -13,7 +13,7 @@ import psutil
 
 from benchmarks import keep, parser, tless_recipe
 from synthetless.dataset.layout import plan_image
-from synthetless.generation.drop import Studio
+from synthetless.generation.drop import DropRenderer
 from synthetless.generation.sources import load_sources
 
 WARM = 20
@@ -27,11 +27,11 @@ def main() -> None:
     arguments = options.parse_args()
     small = ["camera.width=180", "camera.height=135", "render.samples=1", "camera.views_per_drop=1"]
     recipe = tless_recipe(arguments, *small)
-    studio = Studio(recipe, load_sources(recipe), threads=1)
+    renderer = DropRenderer(recipe, load_sources(recipe), threads=1)
     megabytes, seconds = [], []
     for drop in range(arguments.drops):
         began = time.process_time()
-        list(studio.make(drop, [plan_image(drop, 1)]))
+        list(renderer.make(drop, [plan_image(drop, 1)]))
         seconds.append(time.process_time() - began)
         megabytes.append(psutil.Process().memory_info().rss / 1e6)
     growth = max(megabytes[WARM:]) / megabytes[WARM - 1] - 1

@@ -16,10 +16,9 @@ import numpy as np
 
 from benchmarks import default_models, keep
 from synthetless.io.models import load_models
-from synthetless.scenes.mesh import Mesh
 from synthetless.scenes.physics import Collider, NotSettled, PhysicsSettings, collider, settle
 from synthetless.scenes.rotations import random_rotation
-from synthetless.scenes.spec import Pose
+from synthetless.scenes.spec import Mesh, Pose
 
 
 def main() -> None:

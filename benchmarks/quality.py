@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from benchmarks import RESULTS, keep, parser, tless_recipe
 from synthetless.config import Recipe
-from synthetless.generation.drop import Studio
+from synthetless.generation.drop import DropRenderer
 from synthetless.generation.sources import load_sources
 from synthetless.io.color import exposure_gain, tonemap
 from synthetless.io.images import decode_rgb, encode_jpeg, encode_png
-from synthetless.scenes.render import Stage
+from synthetless.scenes.render import BlenderSession
 from synthetless.scenes.settings import RenderSettings
 
 SHRINK = 2
@@ -47,14 +47,14 @@ def main() -> None:
     options.add_argument("--samples", type=int, default=4096, help="of the converged renders")
     arguments = options.parse_args()
     recipe = bench_recipe(arguments)
-    studio = Studio(recipe, load_sources(recipe), threads=1)
+    renderer = DropRenderer(recipe, load_sources(recipe), threads=1)
     rows: dict[str, list[tuple[float, float, float, float]]] = {name: [] for name in CANDIDATES}
     for drop in range(arguments.scenes):
-        spec, settled = studio.drop(drop)
-        with studio.stage.scene(spec, settled) as scene:
-            reference = converged(studio.stage, lambda: scene.render(0), recipe, drop, arguments.samples)
+        spec, settled = renderer.drop(drop)
+        with renderer.session.scene(spec, settled) as scene:
+            reference = converged(renderer.session, lambda: scene.render(0), recipe, drop, arguments.samples)
             for name, (settings, encode) in CANDIDATES.items():
-                studio.stage.configure(settings)
+                renderer.session.configure(settings)
                 began = time.process_time()
                 linear = scene.render(0)
                 spent = time.process_time() - began
@@ -81,13 +81,13 @@ def bench_recipe(arguments: argparse.Namespace) -> Recipe:
 
 
 def converged(
-    stage: Stage, render: Callable[[], NDArray[np.float32]], recipe: Recipe, drop: int, samples: int
+    session: BlenderSession, render: Callable[[], NDArray[np.float32]], recipe: Recipe, drop: int, samples: int
 ) -> NDArray[np.float32]:
     """The scene without noise, rendered once and kept."""
     name = f"converged_{Path(recipe.source.models).name}_{drop}_{samples}.npy"
     path = RESULTS / name
     if not path.exists():
-        stage.configure(RenderSettings(samples=samples, denoiser="none"))
+        session.configure(RenderSettings(samples=samples, denoiser="none"))
         RESULTS.mkdir(exist_ok=True)
         np.save(path, render())
     image: NDArray[np.float32] = np.load(path)

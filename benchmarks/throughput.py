@@ -19,19 +19,19 @@ from synthetless.config import Recipe
 from synthetless.dataset.layout import plan_image
 from synthetless.dataset.store import DatasetStore
 from synthetless.generation import devices
-from synthetless.generation.drop import Studio
+from synthetless.generation.drop import DropRenderer
 from synthetless.generation.sources import load_sources
 
-STAGES = {
+PHASES = {
     "sample": [("sampling.py", "sample_scene")],
-    "physics": [("physics.py", "settle"), ("studio.py", "_collider")],
+    "physics": [("physics.py", "settle"), ("drop.py", "_collider")],
     "build": [("render.py", "scene")],
     "annotate": [("raycast.py", "annotate")],
     "develop": [("color.py", "exposure_gain"), ("color.py", "tonemap")],
-    "encode": [("studio.py", "encode")],
-    "commit": [("dataset.py", "commit")],
+    "encode": [("store.py", "_encode")],
+    "commit": [("store.py", "commit")],
 }
-"""Functions whose time, with all that they call, makes up a stage."""
+"""Functions whose time, with all that they call, makes up a phase."""
 
 _LINE = re.compile(r"^Fra.*Time:(\d+):(\d+\.\d+) .*(Sample 0/|Finished)", re.MULTILINE)
 
@@ -58,20 +58,20 @@ def main() -> None:
 
 
 def measure(recipe: Recipe, images: int, wanted: str) -> dict[str, float]:
-    """Seconds of each stage for all images together; "start" is once."""
+    """Seconds of each phase for all images together; "start" is once."""
     views = recipe.camera.views_per_drop
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "blender.log"
         sources = load_sources(recipe)
         dataset = DatasetStore.open(Path(folder) / "dataset", recipe, sources.models, sources.scenery_digest)
         began = time.perf_counter()
-        studio = Studio(recipe, sources, 1, devices.take(devices.choose(wanted)), log)
+        renderer = DropRenderer(recipe, sources, 1, devices.take(devices.choose(wanted)), log)
         stages = {"start": time.perf_counter() - began}
         # What is made once for each model, whatever the number of images, is made now.
-        studio.stage.configure(recipe.render.model_copy(update={"samples": 1, "denoiser": "none"}))
+        renderer.session.configure(recipe.render.model_copy(update={"samples": 1, "denoiser": "none"}))
         for drop in range(-(-images // views)):
-            list(studio.make(drop, [plan_image(drop * views, views)]))
-        studio.stage.configure(recipe.render)
+            list(renderer.make(drop, [plan_image(drop * views, views)]))
+        renderer.session.configure(recipe.render)
         log.unlink()
 
         profile = cProfile.Profile()
@@ -79,13 +79,13 @@ def measure(recipe: Recipe, images: int, wanted: str) -> dict[str, float]:
         profile.enable()
         for number in range(0, images, views):
             plans = [plan_image(n, views) for n in range(number, min(number + views, images))]
-            for image in studio.make(number // views, plans):
+            for image in renderer.make(number // views, plans):
                 dataset.commit(image)
         profile.disable()
         total = time.perf_counter() - began
         sync, cycles = _logged(log)
         log.unlink()
-        share = _share_of_sampling(studio, log, images, views)
+        share = _share_of_sampling(renderer, log, images, views)
         stages |= _profiled(profile)
         stages |= {"sync": sync, "sampling": share * cycles, "denoise": (1 - share) * cycles}
     return stages | {"other": total - (sum(stages.values()) - stages["start"])}
@@ -94,18 +94,18 @@ def measure(recipe: Recipe, images: int, wanted: str) -> dict[str, float]:
 def _profiled(profile: cProfile.Profile) -> dict[str, float]:
     rows: dict[tuple[str, int, str], tuple[int, int, float, float, object]] = pstats.Stats(profile).stats  # type: ignore[attr-defined]
     times = {(Path(file).name, name): row[3] for (file, _, name), row in rows.items()}
-    return {stage: sum(times.get(key, 0.0) for key in keys) for stage, keys in STAGES.items()}
+    return {phase: sum(times.get(key, 0.0) for key in keys) for phase, keys in PHASES.items()}
 
 
-def _share_of_sampling(studio: Studio, log: Path, images: int, views: int) -> float:
+def _share_of_sampling(renderer: DropRenderer, log: Path, images: int, views: int) -> float:
     """Of sampling and denoising together: the first view of each drop, rendered with and without denoiser."""
     seconds = [0.0, 0.0]
-    settings = studio.stage.settings
+    settings = renderer.session.settings
     for drop in range(-(-images // views)):
-        spec, settled = studio.drop(drop)
-        with studio.stage.scene(spec, settled) as scene:
+        spec, settled = renderer.drop(drop)
+        with renderer.session.scene(spec, settled) as scene:
             for k, variant in enumerate([settings.model_copy(update={"denoiser": "none"}), settings]):
-                studio.stage.configure(variant)
+                renderer.session.configure(variant)
                 scene.render(0)
                 seconds[k] += _logged(log)[1]
                 log.unlink()

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-import yaml
 from pydantic import Field, ValidationError
 
 from synthetless.errors import UserError
+from synthetless.io.documents import parse_document, read_document, shown
 from synthetless.scenes.settings import Bounds, SceneSettings, Settings
 from synthetless.scenes.spec import Intrinsics
 
@@ -108,7 +108,7 @@ def load_recipe(path: Path | None, overrides: Sequence[str] = ()) -> Recipe:
     Raises:
         RecipeError: unreadable file, no mapping, unknown key, value of the wrong kind or outside its range.
     """
-    tree: dict[str, Any] = {} if path is None else _read_yaml(path)
+    tree: dict[str, Any] = {} if path is None else _read_recipe(path)
     origin = "recipe" if path is None else str(path)
     for override in overrides:
         _apply(tree, override)
@@ -138,15 +138,13 @@ def settings(group: type[Settings] = Recipe, prefix: str = "") -> Iterator[Setti
         yield from settings(kind, f"{key}.")
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def _read_recipe(path: Path) -> dict[str, Any]:
+    if not path.exists():
+        raise RecipeError(f"{path}: no such recipe file")
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise RecipeError(f"{path}: no such recipe file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecipeError(f"{path}: cannot be read ({' '.join(str(error).split())})") from None
-    except yaml.YAMLError as error:
-        raise RecipeError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
+        content = read_document(path)
+    except UserError as error:
+        raise RecipeError(str(error)) from None
     if content is None:
         return {}
     if not isinstance(content, dict):
@@ -158,16 +156,16 @@ def _apply(tree: dict[str, Any], override: str) -> None:
     key, equals, text = override.partition("=")
     path = key.strip().split(".")
     if not equals or not all(path):
-        raise RecipeError(f"--set {override}: expected key.path=value")
+        raise RecipeError(f"--set {shown(override)}: expected key.path=value")
     try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise RecipeError(f"--set {override}: {text!r} is not valid YAML") from None
+        value = parse_document(text, shown(text))
+    except UserError as error:
+        raise RecipeError(f"--set {key}: {error}") from None
     node = tree
     for name in path[:-1]:
         child = node.setdefault(name, {})
         if not isinstance(child, dict):
-            raise RecipeError(f"--set {override}: {name} is a single value, it has no settings inside")
+            raise RecipeError(f"--set {key}: {shown(name)} is a single value, it has no settings inside")
         node = child
     node[path[-1]] = value
 
@@ -179,12 +177,12 @@ def _explain(error: ValidationError) -> str:
     if fault["type"] == "extra_forbidden":
         known = [setting.key for setting in settings()]
         groups = sorted({".".join(k.split(".")[:-1]) for k in known} - {""})
-        return f"{key} is no setting{_nearest(key, known + groups)}"
+        return f"unknown setting {shown(key)[1:-1]}{_nearest(key, known + groups)}"
     value = fault["input"]
     detail = _EXPECTED.get(fault["type"]) or fault["msg"][0].lower() + fault["msg"][1:]
     more = len(error.errors()) - 1
     suffix = f" (and {more} more)" if more else ""
-    return f"{key} = {value!r}: {detail}{suffix}"
+    return f"{key} = {shown(value)}: {detail}{suffix}"
 
 
 def _nearest(key: str, known: list[str]) -> str:

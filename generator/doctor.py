@@ -1,12 +1,17 @@
 """Whether this machine can make datasets, and what to do where it cannot.
 
-What the machine is like, ``synthetless.generation.machine`` finds out; here it is judged, by functions of that alone.
+The lower half finds out what the machine is like; the upper half judges it, by functions of that alone.
 """
 
 from __future__ import annotations
 
+import ctypes
+import importlib.metadata
+import importlib.util
 import json
+import re
 import shutil
+import subprocess
 import sys
 import tempfile
 import textwrap
@@ -15,8 +20,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from synthetless.generation import machine
-from synthetless.generation.machine import Answer
+from synthetless.generation.devices import Answer, ask, probe
+from synthetless.io.files import nearest_existing
 from synthetless.io.parallel import usable_cores
 
 PYTHON = (3, 11)
@@ -42,6 +47,10 @@ PACKAGES = {
 """The Debian (and Ubuntu) package of each shared library that Blender may want from the system."""
 LOADED_LATER = ("libXxf86vm.so.1", "libEGL.so.1")
 """Not linked by Blender 4.5, but by other versions, or looked for when they are needed."""
+
+CGROUP = Path("/sys/fs/cgroup")
+MEMINFO = Path("/proc/meminfo")
+_UNLIMITED_BYTES = 2**60  # version 1 of cgroups writes a number near 2**63 where there is no limit
 
 ENOUGH_DISK_GB, LEAST_DISK_GB = 10.0, 0.5
 ENOUGH_MEMORY_GB, LEAST_MEMORY_GB = 4.0, 1.0
@@ -72,26 +81,26 @@ def examine(folder: Path = Path()) -> tuple[Check, ...]:
     Args:
         folder: where datasets are to be made; it need not exist.
     """
-    place = machine.nearest_existing(folder)
+    place = nearest_existing(folder)
     return (
         check_python(sys.version_info[:3]),
-        check_blender(machine.blender_version()),
-        check_libraries(missing_libraries(machine.blender_library()), machine.unloadable(LOADED_LATER)),
-        check_devices(machine.ask(machine.probe("devices"))),
-        check_cores(usable_cores(), machine.core_quota()),
-        check_memory(machine.available_memory_bytes()),
+        check_blender(blender_version()),
+        check_libraries(missing_libraries(blender_library()), unloadable(LOADED_LATER)),
+        check_devices(ask(probe("devices"))),
+        check_cores(usable_cores(), core_quota()),
+        check_memory(available_memory_bytes()),
         check_disk(shutil.disk_usage(place).free, place),
         check_writable(place),
-        check_render(machine.ask(machine.probe("render"))),
+        check_render(ask(probe("render"))),
     )
 
 
 def missing_libraries(blender: Path | None) -> tuple[str, ...]:
     """What Blender is linked with and the system lacks; without Blender or ldd, what it is known to need."""
-    unresolved = machine.unresolved(blender) if blender else None
-    if unresolved is not None:
-        return unresolved
-    return machine.unloadable(name for name in PACKAGES if name not in LOADED_LATER)
+    lacking = unresolved(blender) if blender else None
+    if lacking is not None:
+        return lacking
+    return unloadable(name for name in PACKAGES if name not in LOADED_LATER)
 
 
 def is_fit(checks: Iterable[Check]) -> bool:
@@ -171,7 +180,7 @@ def check_devices(answer: Answer) -> Check:
 
 
 def _by_hand(what: str) -> str:
-    return f"mend what fails above; if nothing does, see what this prints: python -m scenes.probe {what}"
+    return f"mend what fails above; if nothing does, see what this prints: python -m synthetless.scenes.probe {what}"
 
 
 def check_cores(usable: int, quota: float | None) -> Check:
@@ -224,3 +233,74 @@ def check_render(answer: Answer) -> Check:
     if found["mean"] <= 0:
         return Check("render", "fail", f"the image is black; {value}", f"pip install 'bpy=={BLENDER}.*'")
     return Check("render", "ok", value)
+
+
+def blender_version() -> str | None:
+    """Version of the installed bpy, None without one."""
+    try:
+        return importlib.metadata.version("bpy")
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def blender_library() -> Path | None:
+    """The shared library that is the bpy module, found without loading it; None without one."""
+    spec = importlib.util.find_spec("bpy")
+    return Path(spec.origin) if spec and spec.origin else None
+
+
+def unresolved(library: Path) -> tuple[str, ...] | None:
+    """Shared libraries that one is linked with, directly or by others, and that the system lacks; None without ldd."""
+    try:
+        done = subprocess.run(["ldd", library], capture_output=True, text=True, timeout=60, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    if done.returncode:
+        return None
+    return tuple(dict.fromkeys(re.findall(r"^\s*(\S+) => not found", done.stdout, re.MULTILINE)))
+
+
+def unloadable(names: Iterable[str]) -> tuple[str, ...]:
+    """Those of the shared libraries that cannot be loaded."""
+    return tuple(name for name in names if not _loads(name))
+
+
+def _loads(name: str) -> bool:
+    try:
+        ctypes.CDLL(name)
+    except OSError:
+        return False
+    return True
+
+
+def core_quota(cgroup: Path = CGROUP) -> float | None:
+    """How many cores' worth of time a container is granted, None if as much as there is."""
+    quota, period = _numbers(cgroup / "cpu.max", 2)  # "max 100000" without a quota
+    if quota is None:
+        quota, _ = _numbers(cgroup / "cpu" / "cpu.cfs_quota_us", 1)  # version 1; -1 without a quota
+        period, _ = _numbers(cgroup / "cpu" / "cpu.cfs_period_us", 1)
+    return quota / period if quota and quota > 0 and period else None
+
+
+def available_memory_bytes(meminfo: Path = MEMINFO, cgroup: Path = CGROUP) -> int | None:
+    """Memory that a new process can have: what is available, at most a container's limit; None if nothing tells."""
+    try:
+        match = re.search(r"^MemAvailable:\s+(\d+) kB", meminfo.read_text(), re.MULTILINE)
+    except OSError:
+        match = None
+    limits = [_numbers(cgroup / name, 1)[0] for name in ("memory.max", "memory/memory.limit_in_bytes")]
+    known = [int(limit) for limit in limits if limit is not None and limit < _UNLIMITED_BYTES]
+    if match:
+        known.append(1024 * int(match[1]))
+    return min(known, default=None)
+
+
+def _numbers(file: Path, count: int) -> tuple[int | None, int | None]:
+    """The first one or two numbers of a file; None for what is missing or no number."""
+    try:
+        words = file.read_text().split()
+    except OSError:
+        words = []
+    numbers = [int(word) if re.fullmatch(r"-?\d+", word) else None for word in words[:count]]
+    first, second = (*numbers, None, None)[:2]
+    return first, second

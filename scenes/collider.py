@@ -7,19 +7,25 @@ could be touched from outside is far from the true surface.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from synthetless.errors import UserError
 from synthetless.scenes.contact import Surface
-from synthetless.scenes.mesh import Mesh
+from synthetless.scenes.spec import Mesh
 
 Array = NDArray[np.float64]
+Remember = Callable[[Callable[[], dict[str, NDArray[Any]]]], Mapping[str, NDArray[Any]]]
+
+VERSION = f"1-numpy{np.__version__}-scipy{scipy.__version__}"
+"""Of the algorithm below, to be counted up with each change of its results, and of what their last bits depend on."""
 
 MAX_PIECES = 24
 HOLLOW_M = 0.002
@@ -57,8 +63,13 @@ class Collider:
         return float(np.linalg.norm(self.hull_m, axis=1).max())
 
 
-def collider(mesh: Mesh) -> Collider:
-    """Prepare a mesh for physics: about half a second, so keep the result.
+def collider(mesh: Mesh, remember: Remember = lambda compute: compute()) -> Collider:
+    """Prepare a mesh for physics.
+
+    Args:
+        mesh: of the true shape.
+        remember: called with the function that does most of the work, about half a second; it returns what that
+            returns, perhaps from an earlier time. What it keeps must be kept under the mesh and ``VERSION``.
 
     Raises:
         UserError: the mesh is flat.
@@ -66,11 +77,24 @@ def collider(mesh: Mesh) -> Collider:
     if not len(mesh.faces) or np.linalg.matrix_rank(np.diff(mesh.vertices_m[np.unique(mesh.faces)], axis=0)) < 3:
         raise UserError("the mesh is flat; a body needs a volume to fall")
     surface = Surface(mesh)
+    body = remember(lambda: _convex_body(surface))
+    pieces = tuple(np.split(body["pieces_m"], np.cumsum(body["piece_sizes"])[:-1]))
+    return Collider(surface, pieces, body["hull_m"], body["mass_centre_m"], float(body["volume_m3"]))
+
+
+def _convex_body(surface: Surface) -> dict[str, NDArray[Any]]:
+    """What a Collider holds besides the surface, as plain arrays: the pieces one after the other, and their sizes."""
     points = np.concatenate([surface.vertices_m, surface.points_m])
     voxels = _Voxels(surface.points_m, 2 * surface.spacing_m)
     centre, volume = voxels.mass()
-    pieces = tuple(_simplified(piece) - centre for piece in _convex_pieces(points, voxels))
-    return Collider(surface, pieces, _simplified(points) - centre, centre, volume)
+    pieces = [_simplified(piece) - centre for piece in _convex_pieces(points, voxels)]
+    return {
+        "pieces_m": np.concatenate(pieces),
+        "piece_sizes": np.array([len(piece) for piece in pieces]),
+        "hull_m": _simplified(points) - centre,
+        "mass_centre_m": centre,
+        "volume_m3": np.array(volume),
+    }
 
 
 class _Voxels:

@@ -12,7 +12,7 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from synthetless.scenes.mesh import Mesh
+from synthetless.scenes.spec import Mesh
 
 Array = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """What Blender sees and does on this machine, asked in a process of its own: a Blender that crashes takes that along.
 
-``python -m scenes.probe devices`` or ``python -m scenes.probe render`` prints one line of JSON.
+``python -m synthetless.scenes.probe devices`` or ``python -m synthetless.scenes.probe render`` prints one line of JSON.
 """
 
 from __future__ import annotations
@@ -14,11 +14,10 @@ import numpy as np
 import trimesh
 
 from synthetless.scenes import blender
-from synthetless.scenes.mesh import Mesh
-from synthetless.scenes.render import Stage
+from synthetless.scenes.render import BlenderSession
 from synthetless.scenes.sampling import Catalogue, sample_scene
 from synthetless.scenes.settings import ObjectSettings, SceneSettings
-from synthetless.scenes.spec import Intrinsics, Pose
+from synthetless.scenes.spec import Intrinsics, Mesh, Pose
 
 
 def devices() -> dict[str, Any]:
@@ -39,9 +38,9 @@ def render() -> dict[str, Any]:
     spec = sample_scene(settings, Catalogue({1: 0.06}, {}, ()), seed=0, drop=0)
     hovering = [Pose(item.release.rotation_wxyz, (0.06 * (k - 2), 0.0, 0.04)) for k, item in enumerate(spec.objects)]
     intrinsics = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    stage = Stage({("model", 1): mesh}, intrinsics, settings.render, settings.table.size_m)
+    session = BlenderSession({("model", 1): mesh}, intrinsics, settings.render, settings.table.size_m)
     began = time.perf_counter()
-    with stage.scene(spec, hovering) as scene:
+    with session.scene(spec, hovering) as scene:
         image = scene.render(0)
     return {
         "width": camera.width,

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from synthetless.errors import UserError
 from synthetless.scenes import blender, camera, lights, materials
 from synthetless.scenes.blender import RenderDevice
-from synthetless.scenes.mesh import Mesh
 from synthetless.scenes.rotations import matrix
 from synthetless.scenes.settings import RenderSettings
-from synthetless.scenes.spec import Intrinsics, Pose, Role, SceneSpec
+from synthetless.scenes.spec import Intrinsics, Mesh, Pose, Role, SceneSpec
 from synthetless.scenes.textures import PhotoTexture, load_photo, procedural_image
 
 _CREASE_DEG = 30.0
@@ -28,7 +27,7 @@ _CREASE_DEG = 30.0
 
 
 @dataclass(eq=False)
-class Stage:
+class BlenderSession:
     """A Blender session that scenes are built on; meshes are loaded once and kept. At most one per process is in use.
 
     Attributes:
@@ -61,7 +60,7 @@ class Stage:
         _configure(self.bpy.context.scene, settings)
 
     @contextlib.contextmanager
-    def scene(self, spec: SceneSpec, settled: Sequence[Pose]) -> Iterator[BuiltScene]:
+    def scene(self, spec: SceneSpec, settled: Sequence[Pose]) -> Iterator[BlenderScene]:
         """Build a scene, and take it apart again at the end.
 
         Args:
@@ -89,7 +88,7 @@ class Stage:
             bpy_scene.camera = self.bpy.data.objects.new("camera", data)
             collection.objects.link(bpy_scene.camera)
             camera.set_intrinsics(bpy_scene, bpy_scene.camera, self.intrinsics)
-            yield BuiltScene(self, spec, centre_m)
+            yield BlenderScene(self, spec, centre_m)
         finally:
             blender.clear(self.bpy, keep=set(self._loaded.values()))
 
@@ -115,16 +114,16 @@ class Stage:
 
 
 @dataclass(frozen=True, eq=False)
-class BuiltScene:
-    """A scene that stands on a stage.
+class BlenderScene:
+    """A scene that is built in a session.
 
     Attributes:
-        stage: where it stands.
+        session: where it is built.
         spec: what it was built from.
         centre_m: (3,) centre of its objects, world frame.
     """
 
-    stage: Stage
+    session: BlenderSession
     spec: SceneSpec
     centre_m: NDArray[np.float64]
 
@@ -134,14 +133,14 @@ class BuiltScene:
 
     def render(self, view: int) -> NDArray[np.float32]:
         """Linear image (H, W, 3), Rec. 709 primaries, of the given view."""
-        scene = self.stage.bpy.context.scene
+        scene = self.session.bpy.context.scene
         camera.place(scene.camera, *self.extrinsics(view))
         scene.cycles.seed = (self.spec.drop * len(self.spec.views) + view) % 2**31
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "image.exr"
             scene.render.filepath = str(file)
-            with blender.console_to(self.stage.log):
-                self.stage.bpy.ops.render.render(write_still=True)
+            with blender.console_to(self.session.log):
+                self.session.bpy.ops.render.render(write_still=True)
             return read_exr(file)
 
 

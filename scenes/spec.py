@@ -1,4 +1,4 @@
-"""What a scene consists of, as pure data: sampled once, recorded with every image, replayable.
+"""What a scene consists of, as pure data: sampled once, recorded with every image, rendered again from the record.
 
 World frame: metres, right-handed, the table is the plane z = 0 and z points up. Rotations are unit quaternions
 (w, x, y, z) that take model coordinates to world coordinates. Azimuth is measured about +z from +x.
@@ -8,6 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from synthetless.scenes.textures import PhotoTexture, ProceduralTexture
 
@@ -135,3 +138,18 @@ class Intrinsics:
     fy: float
     cx: float
     cy: float
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh in the model frame, as the renderer and the physics see it.
+
+    Attributes:
+        vertices_m: (V, 3) float64, metres.
+        faces: (F, 3) int32 indices into the vertices, counter-clockwise seen from outside.
+        normals: (V, 3) float64 unit vertex normals, or None where the file has none.
+    """
+
+    vertices_m: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    normals: NDArray[np.float64] | None = None

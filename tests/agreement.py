@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synthetless.scenes import camera
-from synthetless.scenes.render import BuiltScene
+from synthetless.scenes.render import BlenderScene
 
 
 @dataclass(frozen=True)
@@ -20,11 +20,11 @@ class CyclesGeometry:
     numbers: NDArray[np.int64]
 
 
-def cycles_geometry(scene: BuiltScene, view: int, folder: Path) -> CyclesGeometry:
+def cycles_geometry(scene: BlenderScene, view: int, folder: Path) -> CyclesGeometry:
     """Render one sample at the exact centre of each pixel, and read the depth and object-index passes."""
     import OpenEXR
 
-    bpy_scene = scene.stage.bpy.context.scene
+    bpy_scene = scene.session.bpy.context.scene
     layer, cycles, render = bpy_scene.view_layers[0], bpy_scene.cycles, bpy_scene.render
     saved = (cycles.samples, cycles.use_denoising, cycles.pixel_filter_type, cycles.filter_width)
     file = folder / "passes.exr"
@@ -35,7 +35,7 @@ def cycles_geometry(scene: BuiltScene, view: int, folder: Path) -> CyclesGeometr
         render.image_settings.file_format = "OPEN_EXR_MULTILAYER"
         render.filepath = str(file)
         camera.place(bpy_scene.camera, *scene.extrinsics(view))
-        scene.stage.bpy.ops.render.render(write_still=True)
+        scene.session.bpy.ops.render.render(write_still=True)
     finally:
         layer.use_pass_z = layer.use_pass_object_index = False
         cycles.samples, cycles.use_denoising, cycles.pixel_filter_type, cycles.filter_width = saved

@@ -17,6 +17,14 @@ settings.load_profile("synthetless")
 ROOT = Path(__file__).resolve().parents[1]
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Tests, and the commands that they start, keep what they compute apart from the user's cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SYNTHETLESS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 def _external(variable: str, fallback: Path) -> Path:
     folder = Path(os.environ.get(variable, fallback))
     if not folder.is_dir():

@@ -19,7 +19,8 @@ FOLDERS = {
 FLOORS = (
     {"errors", "assets"},
     {"scenes"},
-    {"io", "config"},
+    {"io"},
+    {"config"},
     {"annotation"},
     {"symmetry"},
     {"dataset"},

@@ -66,7 +66,7 @@ def test_an_empty_file_is_the_default_recipe(tmp_path: Path) -> None:
         ("outputs=[rgb, dpeth]", ["outputs", "dpeth", "depth"]),
         ("split=../else", ["split"]),
         ("images", ["images", "key.path=value"]),
-        ("images=[", ["not valid YAML"]),
+        ("images=[", ["--set images", "neither JSON nor YAML"]),
         ("images.x=1", ["images"]),
     ],
 )

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from synthetless import doctor
 from synthetless.doctor import Check, Status, examine, is_fit, to_json, to_text
-from synthetless.generation import machine
-from synthetless.generation.machine import Answer, ask
+from synthetless.generation.devices import Answer, ask
+from synthetless.io.files import nearest_existing
 from synthetless.scenes.settings import RenderSettings
 
 STATUSES: tuple[Status, ...] = ("ok", "warn", "fail")
@@ -66,11 +66,13 @@ def test_a_process_that_hangs_is_given_up() -> None:
 
 
 def test_a_missing_blender_is_named() -> None:
-    answer = ask(_python("import sys; sys.modules['bpy'] = None; from scenes.probe import main; main('devices')"))
+    answer = ask(
+        _python("import sys; sys.modules['bpy'] = None; from synthetless.scenes.probe import main; main('devices')")
+    )
     assert answer.problem.startswith("Blender is not installed")
     for check in (doctor.check_devices(answer), doctor.check_render(answer)):
         assert (check.status, check.value) == ("fail", answer.problem)
-        assert "python -m scenes.probe" in check.remedy
+        assert "python -m synthetless.scenes.probe" in check.remedy
 
 
 @pytest.fixture
@@ -93,29 +95,28 @@ def test_a_missing_library_is_found(needy_library: Path) -> None:
 def test_without_blender_the_libraries_it_needs_are_tried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "text.so").write_text("hello")
     monkeypatch.setitem(doctor.PACKAGES, "libnobody.so.7", "libnobody7")
-    assert machine.unresolved(tmp_path / "text.so") is None
+    assert doctor.unresolved(tmp_path / "text.so") is None
     assert "libnobody.so.7" in doctor.missing_libraries(tmp_path / "text.so")
     assert "libnobody.so.7" in doctor.missing_libraries(None)
 
 
 def test_a_blender_that_lacks_a_library_says_which(needy_library: Path) -> None:
-    code = (
-        f"import sys; sys.path.insert(0, {str(needy_library.parent)!r}); from scenes.probe import main; main('render')"
-    )
+    first = f"import sys; sys.path.insert(0, {str(needy_library.parent)!r})"
+    code = f"{first}; from synthetless.scenes.probe import main; main('render')"
     assert "libX1Q.so.6" in ask(_python(code)).problem
 
 
 @pytest.mark.blender
 def test_blender_lacks_nothing_here() -> None:
-    library = machine.blender_library()
+    library = doctor.blender_library()
     assert library is not None
     assert library.name == "__init__.so"
     assert library.parent.name == "bpy"
-    assert machine.unresolved(library) == ()
+    assert doctor.unresolved(library) == ()
 
 
 def test_unloadable_libraries_are_told_from_others() -> None:
-    assert machine.unloadable(["libc.so.6", "libnobody.so.7"]) == ("libnobody.so.7",)
+    assert doctor.unloadable(["libc.so.6", "libnobody.so.7"]) == ("libnobody.so.7",)
 
 
 def test_missing_libraries_come_with_their_packages() -> None:
@@ -197,7 +198,7 @@ def test_a_quota_below_the_number_of_cores_is_told() -> None:
 )
 def test_quota_of_a_container(files: dict[str, str], quota: float | None, tmp_path: Path) -> None:
     _write(tmp_path, files)
-    assert machine.core_quota(tmp_path) == quota
+    assert doctor.core_quota(tmp_path) == quota
 
 
 @pytest.mark.parametrize(
@@ -214,7 +215,7 @@ def test_quota_of_a_container(files: dict[str, str], quota: float | None, tmp_pa
 )
 def test_memory_of_a_container(files: dict[str, str], available: int | None, tmp_path: Path) -> None:
     _write(tmp_path, files)
-    assert machine.available_memory_bytes(tmp_path / "meminfo", tmp_path) == available
+    assert doctor.available_memory_bytes(tmp_path / "meminfo", tmp_path) == available
 
 
 def _write(folder: Path, files: dict[str, str]) -> None:
@@ -252,9 +253,9 @@ def test_a_folder_that_cannot_be_written_even_by_root() -> None:
 def test_the_nearest_existing_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
     monkeypatch.chdir(tmp_path)
-    assert machine.nearest_existing(tmp_path / "a" / "b") == tmp_path
-    assert machine.nearest_existing(tmp_path / "file" / "b") == tmp_path
-    assert machine.nearest_existing(Path("a")) == Path.cwd()
+    assert nearest_existing(tmp_path / "a" / "b") == tmp_path
+    assert nearest_existing(tmp_path / "file" / "b") == tmp_path
+    assert nearest_existing(Path("a")) == Path.cwd()
 
 
 TEXT = st.text(st.characters(blacklist_categories=("Cs", "Cc")), max_size=200)

@@ -123,7 +123,7 @@ def ray_cast(root: Path, models_folder: Path) -> dict[tuple[int, int], ImageAnno
 
 
 class _Maker:
-    """Does what a renderer of drops does, with a draw in place of physics and noise in place of light."""
+    """Does what a DropRenderer does, with a draw in place of physics and noise in place of light."""
 
     def __init__(self, recipe: Recipe, models: Mapping[int, ObjectModel]) -> None:
         self._recipe, self.models = recipe, models

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import textwrap
 from dataclasses import asdict
@@ -19,8 +20,9 @@ from synthetless.generation import devices
 from synthetless.generation.devices import Devices
 from synthetless.generation.drop import DropFailed
 from synthetless.generation.estimate import estimate
-from synthetless.generation.generate import Execution, Summary, generate, redo
+from synthetless.generation.generate import Execution, Summary, generate, retry
 from synthetless.generation.rerender import render_again
+from synthetless.io.cache import CACHE_VARIABLE
 from synthetless.io.files import atomic_write
 from synthetless.io.images import encode_png
 from synthetless.scenes.blender import Kind
@@ -88,12 +90,17 @@ def generate_command(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Only tell what it would take; two images are made to measure.")
     ] = False,
+    no_cache: Annotated[
+        bool, typer.Option("--no-cache", help="Compute meshes' colliders anew, and keep nothing in the cache folder.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Make a dataset: drop, render, measure, label, write.
 
     Example: synthetless generate configs/demo.yaml --out out/demo --set camera.distance_m='[0.5, 0.8]'
     """
+    if no_cache:
+        os.environ[CACHE_VARIABLE] = "off"  # for the workers, too, which inherit it
     resolved = _resolve(recipe, overrides or [], images, seed, models, textures)
     if address is not None and executor != "ray":
         raise UserError(f"--address {address} is of a Ray cluster; add --executor ray")
@@ -181,7 +188,7 @@ def redo_command(
     It is made alone, in the foreground, and put where it is missing.
     """
     try:
-        made = redo(dataset, drop, textures)
+        made = retry(dataset, drop, textures)
     except DropFailed as failure:
         leave(f"drop {drop}: {failure}", EXIT_FAILED)
     print(f"drop {drop}: {made} images in {dataset}")

@@ -12,9 +12,10 @@ import typer
 from synthetless.cli.options import Workers
 from synthetless.dataset.card import write_card
 from synthetless.dataset.relabel import adopt, relabel
+from synthetless.symmetry import SymmetryTable
 from synthetless.symmetry.detection import detect_folder, report
-from synthetless.symmetry.detection.gallery import draw_detected, draw_table
-from synthetless.symmetry.detection.show import describe, read_table
+from synthetless.symmetry.detection.pictures import draw_detected, draw_table
+from synthetless.symmetry.detection.report import describe
 
 TableOption = Annotated[
     Path | None,
@@ -94,7 +95,7 @@ def show_command(
 
     Regressors, margins, and which views are dangerous.
     """
-    read = read_table(table)
+    read = SymmetryTable.read(table)
     if pictures is not None:
         draw_table(read, models or (table if table.is_dir() else table.parent), pictures)
     print(describe(read))

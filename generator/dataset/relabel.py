@@ -15,12 +15,11 @@ import shutil
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from synthetless.dataset.labels import (
@@ -40,17 +39,19 @@ from synthetless.dataset.layout import (
     find_models_folder,
     scene_folders,
 )
+from synthetless.dataset.reader import as_floats, read_recipe
 from synthetless.dataset.records import CanonicalEntry, GtEntry, ModelInfo, read_scene_json
 from synthetless.errors import UserError
+from synthetless.io.documents import read_document
 from synthetless.io.files import atomic_write, json_bytes, locked, read_bytes, read_json, replace_file, write_json
 from synthetless.io.models import INFO_FILE, read_models_info
 from synthetless.io.parallel import each
 from synthetless.symmetry import SymmetryTable
 from synthetless.symmetry.atlas import Scheme
+from synthetless.symmetry.canonical import FULL_DECIMALS, stored_decimals
+from synthetless.symmetry.table import TABLE_KEYS
 
 _SCENE_FILES = ("scene_camera.json", "scene_gt.json", "scene_gt_canonical.json")
-_TABLE_KEYS = {"scheme", "allocentric", "objects"}
-
 Labels = dict[int, list[CanonicalEntry]]
 
 
@@ -185,6 +186,7 @@ def relabel(
         if dry_run:
             refuse_half_labelled(root)
         header = read_json(root / DATASET_FILE)
+        read_recipe(root)  # what describes the dataset afterwards must be readable before
         state = LabelState.read(root, header)
         models_info = read_models_info(root / MODELS_FOLDER)
         after = revised(state.table, symmetries, scheme, models_info)
@@ -227,11 +229,7 @@ def adopt(
     scenes = _adoptable_scenes(root)
     models = models or find_models_folder(root)
     models_info = read_models_info(models)
-    try:
-        declared = SymmetryTable.from_models_info(models_info)
-    except UserError as error:
-        raise UserError(f"{models / INFO_FILE}: {error}") from None
-    table = revised(declared, symmetries, scheme, models_info)
+    table = revised(_declared(scenes, models, models_info, symmetries, workers), symmetries, scheme, models_info)
     with locked(root):
         _refuse_foreign(root, scenes)
         with _draft(root) as draft:
@@ -258,18 +256,57 @@ def revised(
         UserError: what ``SymmetryTable.read`` refuses, an object that the dataset lacks, an unknown scheme.
     """
     if symmetries is None:
-        return SymmetryTable(table.entries, scheme or table.scheme, table.allocentric)
+        return replace(table, scheme=scheme or table.scheme)
     other = SymmetryTable.read(symmetries)
     if strangers := sorted(other.entries.keys() - set(obj_ids)):
         raise UserError(
             f"{symmetries}: object {strangers[0]} is none of the dataset's objects {', '.join(map(str, obj_ids))}"
         )
-    stated = _keys(symmetries)
+    stated = read_document(symmetries)
     return SymmetryTable(
         {**table.entries, **other.entries},
         scheme or (other if "scheme" in stated else table).scheme,
         (other if "allocentric" in stated else table).allocentric,
+        (other if "decimals" in stated else table).decimals,
     )
+
+
+def _declared(
+    scenes: Sequence[ScenePaths],
+    models: Path,
+    models_info: Mapping[int, ModelInfo],
+    symmetries: Path | None,
+    workers: int | None,
+) -> SymmetryTable:
+    """The symmetries that a models_info.json declares of the objects that ``symmetries`` does not name.
+
+    What is wrong with the entry of an object that does not occur does not matter.
+    """
+    named = () if symmetries is None else SymmetryTable.read(symmetries).entries
+    declared, faults = SymmetryTable.declared(models_info, but=named)
+    surveys = list(each(_survey, scenes, workers, "poses", "scene"))
+    if wrong := sorted(obj_id for obj_id in faults if any(obj_id in survey.obj_ids for survey in surveys)):
+        raise UserError(
+            f"{models / INFO_FILE}: {faults[wrong[0]]} (a table that --symmetries names may say it instead)"
+        )
+    found = [survey.decimals for survey in surveys if survey.decimals is not None]
+    return replace(declared, decimals=min(found, default=FULL_DECIMALS))
+
+
+@dataclass(frozen=True)
+class _Survey:
+    """What is in a scene_gt.json: its objects, and with how many decimals the rotations were written, if they tell."""
+
+    obj_ids: frozenset[int]
+    decimals: int | None
+
+
+def _survey(paths: ScenePaths) -> _Survey:
+    images = [image for image in read_scene_json(paths.scene_gt).values() if isinstance(image, list)]
+    entries = [entry for image in images for entry in image if isinstance(entry, dict)]
+    rotations = as_floats([entry.get("cam_R_m2c") for entry in entries])
+    obj_ids = frozenset(entry["obj_id"] for entry in entries if isinstance(entry.get("obj_id"), int))
+    return _Survey(obj_ids, stored_decimals(rotations) if rotations.ndim == 2 else None)
 
 
 # Files that change together
@@ -436,25 +473,16 @@ def _rotations(labels: Sequence[CanonicalEntry]) -> NDArray[np.float64]:
     return np.array([label["cam_R_m2c_canonical"] for label in labels], dtype=np.float64).reshape(len(labels), 9)
 
 
-# What is told of it
+# Reports
 
 
 def _arrow(before: object, after: object) -> str:
     return f"{before}" if before == after else f"{before} -> {after}"
 
 
-def _keys(path: Path) -> set[str]:
-    """What a symmetry table states at its top level."""
-    text = read_bytes(path)
-    try:
-        return set(json.loads(text))
-    except ValueError:
-        return set(yaml.safe_load(text))
-
-
 def _differing(before: SymmetryTable, after: SymmetryTable) -> frozenset[int]:
     """The objects whose labels may differ between two tables."""
-    if (before.scheme, before.allocentric) != (after.scheme, after.allocentric):
+    if replace(before, entries={}) != replace(after, entries={}):
         return frozenset(after.entries)
     return frozenset(obj_id for obj_id, entry in after.entries.items() if before.entries.get(obj_id) != entry)
 
@@ -502,8 +530,8 @@ def _refuse_foreign(root: Path, scenes: list[ScenePaths]) -> None:
     """A file of ours is replaced, one of somebody else's is not. Labels are ours if there is a table beside them."""
     path = root / SYMMETRIES_FILE
     if path.exists():
-        if read_json(path).keys() != _TABLE_KEYS:
-            raise UserError(f"{path}: is no symmetry table of synthetless and would be overwritten; move it away")
+        if not {"scheme", "objects"} <= read_json(path).keys() <= set(TABLE_KEYS):
+            raise UserError(f"{path}: not a symmetry table of synthetless, and would be overwritten; move it away")
         return
     for scene in scenes:
         if scene.scene_gt_canonical.exists() and not is_half_labelled(root):

@@ -7,9 +7,10 @@ them, at any time and as often as one likes.
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
@@ -35,6 +36,7 @@ from synthetless.dataset.layout import (
     ScenePaths,
     image_number,
 )
+from synthetless.dataset.reader import read_recipe
 from synthetless.dataset.records import CocoFile, GtEntry, ImageRecord, ImageSpec, ModelInfo
 from synthetless.errors import UserError
 from synthetless.io import images
@@ -44,6 +46,7 @@ from synthetless.io.models import INFO_FILE, ObjectModel
 from synthetless.scenes.spec import Pose, SceneSpec
 from synthetless.symmetry import SymmetryTable
 
+_SIX_DIGITS = re.compile(r"\d{6}")
 _MAY_CHANGE = ("images", "name", "source")
 """Settings that a dataset may be continued under another value of: the sources are compared by their content."""
 
@@ -113,15 +116,26 @@ def image_record(
 
 
 @dataclass(frozen=True)
+class _Assembled:
+    """A scene folder whose JSON files tell of every record that its folder of records, last changed then, holds."""
+
+    records_changed_ns: int
+    images: int
+    instances: int
+
+
+@dataclass(frozen=True)
 class DatasetStore:
     """A dataset folder and the recipe that fills it."""
 
     root: Path
     recipe: Recipe
+    _assembled: dict[int, _Assembled] = field(default_factory=dict, init=False, compare=False, repr=False)
+    """What this process knows to be assembled: the cost of assembling does not grow with what is finished."""
 
     @classmethod
     def open(cls, root: Path, recipe: Recipe, models: Mapping[int, ObjectModel], scenery_digest: str) -> DatasetStore:
-        """Begin a dataset, or go on with one that was made from the same recipe, models and photographs.
+        """Begin a dataset, or continue one that was made from the same recipe, models and photographs.
 
         Raises:
             UserError: the folder holds something else, or cannot be written.
@@ -129,11 +143,11 @@ class DatasetStore:
         known = root / DATASET_FILE
         header = _header(recipe, models, scenery_digest)
         if known.exists():
-            before = read_json(known)
-            _refuse_other(known, before, header)
-            recipe = recipe.model_copy(update={"images": max(recipe.images, before["recipe"]["images"])})
+            begun_with = read_recipe(root)  # with today's defaults for settings that it did not know
+            _refuse_other(known, {**read_json(known), "recipe": dump_recipe(begun_with)}, header)
+            recipe = recipe.model_copy(update={"images": max(recipe.images, begun_with.images)})
         else:
-            _refuse_foreign(root)
+            make_folder(root)
             write_json(known, header)
         dataset = cls(root, recipe)
         dataset._write_companions(models)
@@ -149,10 +163,7 @@ class DatasetStore:
 
     def done(self) -> set[int]:
         """Numbers of the images that exist."""
-        return {
-            image_number(int(path.parent.name), int(path.stem))
-            for path in (self.root / RECORDS_FOLDER).glob("*/*.json")
-        }
+        return {image_number(scene_id, im_id) for scene_id in self._recorded() for im_id in self._record_ids(scene_id)}
 
     def missing(self) -> list[int]:
         """Numbers of the images that the recipe asks for and that do not exist yet, ascending."""
@@ -185,6 +196,7 @@ class DatasetStore:
     def finish(self) -> None:
         """Assemble, and describe the dataset in its card; errors as in ``assemble``."""
         with in_turn(self.root):
+            self._assembled.clear()
             if self._assemble():
                 write_card(self.root)
 
@@ -194,18 +206,35 @@ class DatasetStore:
         header = read_json(self.root / DATASET_FILE)
         state = LabelState.read(self.root, header)
         infos = {int(key): info for key, info in read_json(self.root / MODELS_FOLDER / INFO_FILE).items()}
-        images = instances = 0
-        for folder in sorted((self.root / RECORDS_FOLDER).glob("*")):
-            gt = self._assemble_scene(int(folder.name), state, infos)
-            images += len(gt)
-            instances += sum(len(entries) for entries in gt.values())
+        for scene_id in self._recorded():
+            changed_ns = self._records(scene_id).stat().st_mtime_ns
+            known = self._assembled.get(scene_id)
+            if known is None or known.records_changed_ns != changed_ns or not state.trusted:
+                gt = self._assemble_scene(scene_id, state, infos)
+                instances = sum(len(entries) for entries in gt.values())
+                self._assembled[scene_id] = _Assembled(changed_ns, len(gt), instances)
+        images = sum(known.images for known in self._assembled.values())
         header["recipe"] = dump_recipe(self.recipe)
-        header["counts"] = {"images": images, "instances": instances}
+        header["counts"] = {
+            "images": images,
+            "instances": sum(known.instances for known in self._assembled.values()),
+        }
         header["symmetries"] = describe_symmetries(state.table)
         write_json(self.root / DATASET_FILE, header)
         if is_half_labelled(self.root):
             replace_file(self.root / PENDING_FILE, self.root / SYMMETRIES_FILE)
         return images
+
+    def _recorded(self) -> list[int]:
+        """Numbers of the scene folders that have records."""
+        folder = self.root / RECORDS_FOLDER
+        found = folder.iterdir() if folder.is_dir() else ()
+        return sorted(int(path.name) for path in found if _SIX_DIGITS.fullmatch(path.name))
+
+    def _record_ids(self, scene_id: int) -> list[int]:
+        """Ids of the images of a scene folder that have a record, ascending; files of other names are no records."""
+        found = self._records(scene_id).iterdir()
+        return sorted(int(path.stem) for path in found if path.suffix == ".json" and _SIX_DIGITS.fullmatch(path.stem))
 
     def _records(self, scene_id: int) -> Path:
         return self.root / RECORDS_FOLDER / f"{scene_id:06d}"
@@ -215,7 +244,7 @@ class DatasetStore:
     ) -> dict[int, list[GtEntry]]:
         """Write the JSON files of a scene folder, unless they tell of every record already; return scene_gt."""
         scene = self.scene(scene_id)
-        paths = {int(path.stem): path for path in sorted(self._records(scene_id).glob("*.json"))}
+        paths = {im_id: self.record(scene_id, im_id) for im_id in self._record_ids(scene_id)}
         if scene.scene_camera.exists():
             listed = records.read_scene_json(scene.scene_camera).keys()
             if listed - paths.keys():
@@ -310,7 +339,12 @@ def versions() -> dict[str, str]:
     return {name: version(name) for name in ("synthetless", "bpy")}
 
 
-def _refuse_foreign(root: Path) -> None:
+def make_folder(root: Path) -> None:
+    """Make the folder of a dataset that is to be begun.
+
+    Raises:
+        DatasetError: it cannot be made, or holds files of something else.
+    """
     try:
         root.mkdir(parents=True, exist_ok=True)
         strangers = sorted(path.name for path in root.iterdir() if not path.name.startswith("."))
@@ -327,7 +361,7 @@ def _refuse_other(path: Path, before: Mapping[str, Any], now: Mapping[str, Any])
     for key in ("versions", "models_sha256", "scenery_digest"):
         if before.get(key) != now[key]:
             raise DatasetError(f"{path}: was begun with other {key} than now; use another output folder")
-    old, new = _flat(before.get("recipe", {})), _flat(now["recipe"])
+    old, new = _flat(before["recipe"]), _flat(now["recipe"])
     for key in sorted(old.keys() | new.keys()):
         if key.split(".", maxsplit=1)[0] not in _MAY_CHANGE and old.get(key) != new.get(key):
             raise DatasetError(

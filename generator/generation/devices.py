@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import signal
+import subprocess
+import sys
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from synthetless.errors import UserError
-from synthetless.generation import machine
 from synthetless.io.files import claim
 from synthetless.scenes import blender
 from synthetless.scenes.blender import KINDS, BlenderError, RenderDevice
@@ -37,7 +42,7 @@ def choose(wanted: str) -> Devices:
     """
     if wanted == "cpu":
         return CPU
-    answer = machine.ask(machine.probe("devices"))
+    answer = ask(probe("devices"))
     if answer.found is None:
         raise BlenderError(f"the devices cannot be listed: {answer.problem}; see `synthetless doctor`")
     return best([device["type"] for device in answer.found["devices"]], wanted)
@@ -74,3 +79,37 @@ def best(seen: list[str], wanted: str) -> Devices:
         found = ", ".join(kind for kind in KINDS if counts[kind]) or "none"
         raise UserError(f"--device {wanted}: Blender sees no such device here, only {found}; see `synthetless doctor`")
     return Devices(wanted, counts[wanted] if wanted != "cpu" else 1)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a process of its own found out: ``found``, or the ``problem`` it had instead, one line."""
+
+    found: dict[str, Any] | None
+    problem: str = ""
+
+
+def ask(command: Sequence[str], timeout_s: float = 300.0) -> Answer:
+    """Run a command that prints a JSON object as its last line; whatever happens to it, this process lives on."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=timeout_s, check=False)
+    except subprocess.TimeoutExpired:
+        return Answer(None, f"no answer within {timeout_s:g} s")
+    if done.returncode < 0:
+        return Answer(None, f"crashed ({signal.Signals(-done.returncode).name})")
+    if done.returncode > 0:
+        return Answer(None, _last_line(done.stderr) or f"ended with exit code {done.returncode}")
+    try:
+        found = json.loads(_last_line(done.stdout))
+    except ValueError:
+        found = None
+    return Answer(found) if isinstance(found, dict) else Answer(None, "gave no answer")
+
+
+def probe(what: str) -> tuple[str, ...]:
+    """The command that asks Blender for its ``devices`` or a test ``render``."""
+    return (sys.executable, "-m", "synthetless.scenes.probe", what)
+
+
+def _last_line(text: str) -> str:
+    return (text.strip().splitlines() or [""])[-1].strip()

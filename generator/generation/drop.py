@@ -1,12 +1,13 @@
 """Makes the images of a drop: draw it, let it fall, render it, measure it, encode it.
 
-One studio per process: it holds the Blender session, the meshes and their ray-casting trees, all loaded once.
+One DropRenderer per process: it holds the Blender session, the meshes and their ray-casting trees, all loaded once.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from synthetless.annotation.scene import annotate_scene, scene_caster
@@ -14,13 +15,14 @@ from synthetless.config import Recipe
 from synthetless.dataset.layout import ImagePlan
 from synthetless.dataset.store import FinishedImage
 from synthetless.generation.sources import Sources
+from synthetless.io.cache import Cache, digest
 from synthetless.io.models import ObjectModel
 from synthetless.scenes.blender import CPU, RenderDevice
-from synthetless.scenes.mesh import Mesh
-from synthetless.scenes.physics import Collider, NotSettled, PhysicsSettings, collider, settle
-from synthetless.scenes.render import BuiltScene, Stage
+from synthetless.scenes.collider import VERSION, Collider, collider
+from synthetless.scenes.physics import NotSettled, PhysicsSettings, settle
+from synthetless.scenes.render import BlenderScene, BlenderSession
 from synthetless.scenes.sampling import sample_scene
-from synthetless.scenes.spec import Pose, Role, SceneSpec
+from synthetless.scenes.spec import Mesh, Pose, Role, SceneSpec
 
 _MM = 1000.0
 ModelKey = tuple[Role, int]
@@ -30,11 +32,11 @@ class DropFailed(Exception):
     """A drop did not come to rest however often it was thrown; the message says why the last throw did not."""
 
 
-class Studio:
+class DropRenderer:
     """Turns drops into images.
 
     Attributes:
-        stage: the Blender session.
+        session: the Blender session.
     """
 
     def __init__(
@@ -60,8 +62,9 @@ class Studio:
         self._catalogue = sources.catalogue
         self._meshes = {key: Mesh(model.vertices_mm / _MM, model.faces) for key, model in models.items()}
         self._colliders: dict[ModelKey, Collider] = {}
+        self._cache = Cache.default()
         self._caster = scene_caster(by_role)
-        self.stage = Stage(
+        self.session = BlenderSession(
             self._meshes,
             recipe.intrinsics,
             recipe.render,
@@ -84,7 +87,7 @@ class Studio:
             UserError: an input file became unreadable.
         """
         spec, settled = self.drop(drop)
-        with self.stage.scene(spec, settled) as scene:
+        with self.session.scene(spec, settled) as scene:
             for plan in plans:
                 yield self._image(plan, scene, settled)
 
@@ -110,10 +113,12 @@ class Studio:
 
     def _collider(self, key: ModelKey) -> Collider:
         if key not in self._colliders:
-            self._colliders[key] = collider(self._meshes[key])
+            mesh = self._meshes[key]
+            content = digest(mesh.vertices_m, mesh.faces)
+            self._colliders[key] = collider(mesh, partial(self._cache.arrays, "collider", content, VERSION))
         return self._colliders[key]
 
-    def _image(self, plan: ImagePlan, scene: BuiltScene, settled: Sequence[Pose]) -> FinishedImage:
+    def _image(self, plan: ImagePlan, scene: BlenderScene, settled: Sequence[Pose]) -> FinishedImage:
         annotated = annotate_scene(self._caster, self._recipe, scene.spec, settled, plan.view)
         linear = scene.render(plan.view) if {"rgb", "exr"} & set(self._recipe.outputs) else None
         return FinishedImage.of(self._recipe, plan, scene.spec, settled, annotated, linear)

@@ -12,10 +12,10 @@ from synthetless.dataset.layout import DATASET_FILE, IMAGES_PER_SCENE, MODELS_FO
 from synthetless.dataset.store import DatasetStore
 from synthetless.errors import UserError
 from synthetless.generation import devices
-from synthetless.generation.drop import Studio
+from synthetless.generation.drop import DropRenderer
 from synthetless.generation.generate import Execution, wanted
-from synthetless.generation.machine import nearest_existing
 from synthetless.generation.sources import Sources, check_photos, load_sources
+from synthetless.io.files import nearest_existing
 
 _PROBES = 2
 
@@ -108,17 +108,17 @@ def _measure(recipe: Recipe, sources: Sources, execution: Execution, drops: list
     """Seconds of a drop, seconds and bytes of an image of it; what is done once only is not counted."""
     if not drops:
         return 0.0, 0.0, 0
-    studio = Studio(recipe, sources, execution.threads, devices.take(execution.devices))
+    renderer = DropRenderer(recipe, sources, execution.threads, devices.take(execution.devices))
     dropping, making, size = 0.0, 0.0, 0
     views = recipe.camera.views_per_drop
-    list(studio.make(drops[0], [plan_image(drops[0] * views, views)]))  # so that a GPU has compiled its programs
+    list(renderer.make(drops[0], [plan_image(drops[0] * views, views)]))  # so that a GPU has compiled its programs
     for drop in drops:
         plan = plan_image(drop * views, views)
-        studio.drop(drop)  # the objects' colliders are made once and kept
+        renderer.drop(drop)  # the objects' colliders are made once and kept
         began = time.perf_counter()
-        studio.drop(drop)
+        renderer.drop(drop)
         dropped = time.perf_counter()
-        (image,) = studio.make(drop, [plan])
+        (image,) = renderer.make(drop, [plan])
         dropping += dropped - began
         making += time.perf_counter() - dropped - (dropped - began)
         size += sum(len(content) for content in image.files.values())

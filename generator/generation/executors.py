@@ -1,40 +1,59 @@
-"""Where drops are made: processes that may die, hang or swell without taking the rest of the dataset with them."""
+"""Makes drops in worker processes, which may die, hang or grow without taking the rest of the dataset with them.
+
+Each worker has a pipe of its own and never more than one drop. So it is always known which drop a dead worker was at,
+and nothing that it held can block the others: pools that share one queue lose a task, or break, when a worker is killed
+at the wrong moment.
+"""
 
 from __future__ import annotations
 
 import os
+import platform
 import signal
 import time
-from collections.abc import Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+import traceback
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import islice
-from multiprocessing import get_context
+from itertools import count, islice
+from multiprocessing import connection, get_context, resource_tracker
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 import psutil
-from pebble import ProcessExpired, ProcessPool
 
 from synthetless.config import Recipe
 from synthetless.dataset.layout import LOGS_FOLDER, ImagePlan
-from synthetless.dataset.store import DatasetError, DatasetStore
+from synthetless.dataset.store import DatasetError, DatasetStore, FinishedImage
+from synthetless.errors import UserError
 from synthetless.generation import devices
 from synthetless.generation.devices import CPU, Devices
-from synthetless.generation.drop import DropFailed, Studio
-from synthetless.generation.sources import load_sources
-from synthetless.scenes.blender import BlenderError
+from synthetless.generation.drop import DropFailed, DropRenderer
+from synthetless.generation.sources import Sources, load_sources
+from synthetless.scenes.blender import BlenderError, RenderDevice, console_to
 
 FAULT_VARIABLE = "SYNTHETLESS_FAULTS"
 """For tests of what survives: "abort:3,hang:5" lets drop 3 kill its worker and drop 5 never end."""
-_RENEW = 75
-"""Exit code of a worker that asks to be replaced because its memory has grown."""
-GROWTH_LIMIT_BYTES = 1.5e9
+
+_GROWTH_LIMIT_BYTES = 1.5e9
 """A worker that has grown by so much is replaced."""
+_EXIT_NO_MEMORY = 75
+_DEATHS = 2
+"""A drop over which so many workers died is given up."""
+_DEATHS_AT_START = 12
+"""The run ends when so many workers have died while starting, one after the other, and none got through."""
+_START_LIMIT_S = 600.0
+"""A worker that has not started after so long counts as dead."""
+_END_LIMIT_S = 10.0
+"""How long a worker without work may take to end."""
+_TICK_S = 1.0
+"""How often the time limits are checked."""
 
 
 @dataclass(frozen=True)
-class Job:
+class DropTask:
     """The images wanted of one drop."""
 
     drop: int
@@ -42,24 +61,28 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What became of a job.
+class DropResult:
+    """What became of a task.
 
     Attributes:
-        job: which one.
-        made: how many images were committed.
+        task: which one.
+        made: how many images were made.
         failure: why some are missing, "" if none are.
         killed: whether the worker died over it.
+        images: those of the made ones that are still to be committed.
+        outgrown: whether the worker's memory has grown so much that it should be replaced.
     """
 
-    job: Job
+    task: DropTask
     made: int = 0
     failure: str = ""
     killed: bool = False
+    images: tuple[FinishedImage, ...] = ()
+    outgrown: bool = False
 
 
 @dataclass(frozen=True)
-class Workplace:
+class WorkerConfig:
     """What a worker needs to know.
 
     Attributes:
@@ -77,97 +100,243 @@ class Workplace:
     devices: Devices = CPU
 
 
-def run(jobs: Iterable[Job], place: Workplace, workers: int) -> Iterator[Outcome]:
-    """Make drops in worker processes, and tell of each as it ends, in no fixed order.
+class DropWorker:
+    """Makes drops, one after the other, in a process of its own: the same on this machine and on a cluster."""
+
+    def __init__(self, config: WorkerConfig, sources: Sources, device: RenderDevice, log: Path) -> None:
+        """Load what all drops share, and start Blender, which from then on prints to ``log``."""
+        self._renderer = DropRenderer(config.recipe, sources, config.threads, device, log)
+        self._memory_limit = psutil.Process().memory_info().rss + _GROWTH_LIMIT_BYTES
+
+    def make(self, task: DropTask, commit: Callable[[FinishedImage], None]) -> DropResult:
+        """Make the images of one drop, and call ``commit`` with each as soon as it is made.
+
+        Raises:
+            DatasetError: an image cannot be written.
+            BlenderError: Blender cannot be used.
+        """
+        made, failure = 0, ""
+        try:
+            _inject_fault(task.drop)
+            for image in self._renderer.make(task.drop, task.images):
+                commit(image)
+                made += 1
+        except (DatasetError, BlenderError):
+            raise
+        except DropFailed as error:
+            failure = str(error)
+        except MemoryError:  # the process ends and returns its memory, and the drop is tried in a new one
+            traceback.print_exc()
+            os._exit(_EXIT_NO_MEMORY)
+        except Exception as error:  # an unexpected error in one drop does not stop the others
+            failure = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        outgrown = psutil.Process().memory_info().rss > self._memory_limit
+        return DropResult(task, made, failure, outgrown=outgrown)
+
+
+def run(tasks: Iterable[DropTask], config: WorkerConfig, workers: int) -> Generator[DropResult, None, None]:
+    """Make drops in worker processes, and return the result of each as it ends, in no fixed order.
 
     A drop that kills its worker is tried once more in another one and then reported, one that hangs is reported at
-    once; all others go on.
+    once; all others are continued. A worker that dies while it starts is replaced.
 
     Raises:
-        DatasetError: a file of the dataset cannot be written; nothing further is made.
-        BlenderError: Blender cannot be used.
+        UserError: a file of the dataset cannot be written, or the sources cannot be read any more; nothing further is
+            made.
+        BlenderError: Blender cannot be used, or workers die again and again while they start.
     """
-    waiting, retried = iter(jobs), set[int]()
-    running: dict[Future[Outcome], Job] = {}
-    with ProcessPool(max_workers=workers, context=get_context("spawn")) as pool:
+    pool = _LocalPool(config, workers)
+    try:
+        yield from pool.work(tasks)
+        pool.stop(_END_LIMIT_S)
+    finally:
+        pool.stop(0.0)  # an image is committed whole or not at all, so workers may die at any moment
 
-        def submit(jobs: Iterable[Job]) -> None:
-            for job in jobs:
-                running[pool.schedule(_make, args=(place, job), timeout=place.drop_limit_s)] = job
 
+@dataclass(eq=False)
+class _Worker:
+    """A worker process, seen from the process that started it.
+
+    Attributes:
+        process, pipe: itself, and the way to it.
+        log: file that takes everything it prints, from its first moment.
+        since: when it began what it does now.
+        ready: whether it has started.
+        task: what it does; None while it starts, and between two tasks.
+    """
+
+    process: SpawnProcess
+    pipe: Connection
+    log: Path
+    since: float
+    ready: bool = False
+    task: DropTask | None = None
+
+    def stop(self, grace_s: float) -> None:
+        """End the process: by itself, if it does so within a time."""
+        self.pipe.close()
+        self.process.join(grace_s)
+        self.process.kill()
+        self.process.join()
+
+    def last_words(self) -> str:
+        """The last lines of its log, as one line; "" if it has none."""
         try:
-            submit(islice(waiting, 2 * workers))  # enough that no worker waits, few enough to stop at once
-            while running:
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    job = running.pop(future)
-                    outcome = _outcome(future, job, place)
-                    if outcome is None:
-                        submit([job])
-                    elif outcome.killed and job.drop not in retried:
-                        retried.add(job.drop)
-                        submit([job])
-                    else:
-                        submit(islice(waiting, 1))
-                        yield outcome
-        except BaseException:
-            pool.stop()  # an image is committed whole or not at all, so workers may die at any moment
-            raise
+            text = self.log.read_bytes()[-2000:].decode(errors="replace")
+        except OSError:
+            return ""
+        return " / ".join(" ".join(line.split()) for line in text.splitlines()[-3:] if line.strip())
 
 
-def _outcome(future: Future[Outcome], job: Job, place: Workplace) -> Outcome | None:
-    """How a job ended; None if its worker only asked to be replaced."""
-    try:
-        return future.result()
-    except (DatasetError, BlenderError):
-        raise
-    except TimeoutError:
-        return Outcome(job, failure=f"took longer than {place.drop_limit_s:g} s")
-    except ProcessExpired as death:
-        if death.exitcode == _RENEW:
+class _LocalPool:
+    """The workers of this machine."""
+
+    def __init__(self, config: WorkerConfig, workers: int) -> None:
+        self._config = config
+        self._most = workers
+        self._workers: list[_Worker] = []
+        self._waiting: deque[DropTask] = deque()
+        self._deaths: dict[int, int] = {}
+        self._deaths_at_start = 0
+        self._numbers = count(1)
+
+    def work(self, tasks: Iterable[DropTask]) -> Iterator[DropResult]:
+        """Do all the tasks; errors as in ``run``."""
+        source = iter(tasks)
+        while True:
+            self._waiting.extend(islice(source, max(0, self._most - len(self._waiting))))
+            busy = sum(worker.task is not None for worker in self._workers)
+            if not self._waiting and not busy:
+                return
+            while len(self._workers) < min(self._most, busy + len(self._waiting)):
+                self._start_worker()
+            for worker in [worker for worker in self._workers if worker.ready and worker.task is None]:
+                self._hand_out(worker)
+            answered = connection.wait([worker.pipe for worker in self._workers], timeout=_TICK_S)
+            for worker in [worker for worker in self._workers if worker.pipe in answered]:
+                result = self._receive(worker)
+                if result:
+                    yield result
+            yield from self._give_up_hung()
+
+    def stop(self, grace_s: float) -> None:
+        """End all workers."""
+        while self._workers:
+            self._workers.pop().stop(grace_s)
+
+    def _start_worker(self) -> None:
+        log = self._config.root / LOGS_FOLDER / f"worker-{platform.node()}-{os.getpid()}-{next(self._numbers)}.log"
+        try:
+            log.parent.mkdir(exist_ok=True)
+            log.touch()
+        except OSError as error:
+            raise DatasetError(f"{log}: cannot be written ({error.strerror})") from None
+        context = get_context("spawn")
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_serve, args=(theirs, self._config, log), daemon=True)
+        worker = _Worker(process, ours, log, time.monotonic())
+        try:
+            with _without_interrupts(), console_to(log):
+                process.start()
+        except OSError as error:  # no memory, or no process, is left for it
+            ours.close()
+            time.sleep(_TICK_S)
+            self._died_at_start(f"cannot be started: {error.strerror}", worker)
+        else:
+            self._workers.append(worker)
+        finally:
+            theirs.close()  # so that its end is the pipe's end
+
+    def _hand_out(self, worker: _Worker) -> None:
+        """Give a worker the next task, if there is one."""
+        if not self._waiting:
+            return
+        try:
+            worker.pipe.send(self._waiting[0])
+        except OSError:  # it has died since; that is no fault of this task
+            self._remove(worker)
+        else:
+            worker.task, worker.since = self._waiting.popleft(), time.monotonic()
+
+    def _receive(self, worker: _Worker) -> DropResult | None:
+        """Read what a worker sends; the result of its task, if that is known now."""
+        try:
+            answer = worker.pipe.recv()
+        except (EOFError, OSError):
+            return self._died(worker)
+        if isinstance(answer, Exception):
+            raise answer
+        self._deaths_at_start = 0
+        if not isinstance(answer, DropResult):
+            worker.ready = True
             return None
-        return Outcome(job, failure=f"its worker died (exit code {death.exitcode})", killed=True)
-    except Exception as error:  # whatever one drop stumbles over, the others can be made
-        return Outcome(job, failure=stumbled(error))
+        worker.task = None
+        if answer.outgrown:
+            self._remove(worker, _END_LIMIT_S)
+        return answer
+
+    def _died(self, worker: _Worker) -> DropResult | None:
+        """Replace a worker; the result of its task, if that task has killed too many."""
+        worker.process.join(_TICK_S)
+        self._remove(worker)
+        task, why = worker.task, f"exit code {worker.process.exitcode}"
+        if task is None:
+            if not worker.ready:
+                self._died_at_start(why, worker)
+            return None
+        self._deaths[task.drop] = self._deaths.get(task.drop, 0) + 1
+        if self._deaths[task.drop] < _DEATHS:
+            self._waiting.appendleft(task)
+            return None
+        return DropResult(task, failure=f"its worker died ({why})", killed=True)
+
+    def _died_at_start(self, why: str, worker: _Worker) -> None:
+        self._deaths_at_start += 1
+        if self._deaths_at_start >= _DEATHS_AT_START:
+            words = worker.last_words()
+            told = f"; {worker.log} ends: {words}" if words else "; they printed nothing"
+            raise BlenderError(f"{self._deaths_at_start} workers died while starting, the last one with {why}{told}")
+
+    def _give_up_hung(self) -> Iterator[DropResult]:
+        now, limit_s = time.monotonic(), self._config.drop_limit_s
+        for worker in list(self._workers):
+            if worker.task is not None and now - worker.since > limit_s and not worker.pipe.poll():
+                self._remove(worker)
+                yield DropResult(worker.task, failure=f"took longer than {limit_s:g} s")
+            elif not worker.ready and now - worker.since > _START_LIMIT_S:
+                self._remove(worker)
+                self._died_at_start(f"no answer within {_START_LIMIT_S:g} s", worker)
+
+    def _remove(self, worker: _Worker, grace_s: float = 0.0) -> None:
+        self._workers.remove(worker)
+        worker.stop(grace_s)
 
 
-def _make(place: Workplace, job: Job) -> Outcome:
-    """In the worker: make and commit the images of one drop."""
-    inject_fault(job.drop)
-    dataset, studio = DatasetStore(place.root, place.recipe), _studio(place)
-    if psutil.Process().memory_info().rss > _memory_at_start(place) + GROWTH_LIMIT_BYTES:
-        os._exit(_RENEW)
-    made = 0
+def _serve(pipe: Connection, config: WorkerConfig, log: Path) -> None:
+    """In the worker: start, and make drops as long as there is somebody to make them for."""
+    with suppress(EOFError, ConnectionError):
+        try:
+            worker = DropWorker(config, load_sources(config.recipe), devices.take(config.devices), log)
+            commit = DatasetStore(config.root, config.recipe).commit
+            pipe.send(None)  # started
+            while True:
+                pipe.send(worker.make(pipe.recv(), commit))
+        except (UserError, BlenderError) as error:
+            pipe.send(error)
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Processes that are started meanwhile never see Ctrl-C, which is for this one to answer, afterwards."""
+    resource_tracker.ensure_running()  # the first start of a process would start it, and let interrupts in again
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        for image in studio.make(job.drop, job.images):
-            dataset.commit(image)
-            made += 1
-    except DropFailed as failure:
-        return Outcome(job, made, str(failure))
-    return Outcome(job, made)
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
-@lru_cache(maxsize=1)
-def _studio(place: Workplace) -> Studio:
-    """The studio of this worker, set up at its first drop: from there on Blender talks to the worker's log."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's to answer
-    logs = place.root / LOGS_FOLDER
-    logs.mkdir(exist_ok=True)
-    log = logs / f"worker-{os.getpid()}.log"
-    return Studio(place.recipe, load_sources(place.recipe), place.threads, devices.take(place.devices), log)
-
-
-@lru_cache(maxsize=1)
-def _memory_at_start(place: Workplace) -> int:
-    rss: int = psutil.Process().memory_info().rss
-    return rss
-
-
-def stumbled(error: Exception) -> str:
-    """What a drop failed of that nobody had thought of, one line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
-
-
-def inject_fault(drop: int) -> None:
+def _inject_fault(drop: int) -> None:
     """Do to this worker what FAULT_VARIABLE asks for at this drop."""
     faults = dict(item.split(":") for item in os.environ.get(FAULT_VARIABLE, "").split(",") if item)
     kind = next((kind for kind, number in faults.items() if int(number) == drop), "")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterable
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -16,12 +17,12 @@ from synthetless.dataset import records
 from synthetless.dataset.layout import DATASET_FILE, FAILURES_FOLDER, SHEET_FILE, Part, by_drop, plan_image, scene_ids
 from synthetless.dataset.reader import read_recipe
 from synthetless.dataset.sheet import write_contact_sheet
-from synthetless.dataset.store import DatasetStore
+from synthetless.dataset.store import DatasetStore, make_folder
 from synthetless.errors import UserError
-from synthetless.generation import cluster, executors
+from synthetless.generation import executors, ray_executor
 from synthetless.generation.devices import CPU, Devices
-from synthetless.generation.drop import Studio
-from synthetless.generation.executors import Job, Outcome, Workplace
+from synthetless.generation.drop import DropRenderer
+from synthetless.generation.executors import DropResult, DropTask, WorkerConfig
 from synthetless.generation.sources import Sources, check_photos, load_sources
 from synthetless.io.files import in_turn, locked, write_json
 from synthetless.io.parallel import usable_cores
@@ -80,7 +81,7 @@ class Execution:
 
 
 def generate(recipe: Recipe, out: Path, execution: Execution) -> Summary:
-    """Make the images that the dataset in ``out`` lacks; an interrupted run is gone on with.
+    """Make the images that the dataset in ``out`` lacks; an interrupted run is continued.
 
     Args:
         recipe: what to make.
@@ -94,15 +95,18 @@ def generate(recipe: Recipe, out: Path, execution: Execution) -> Summary:
     sources = load_sources(recipe)
     if not (out / DATASET_FILE).exists():
         check_photos(sources)
-    dataset = DatasetStore.open(out, recipe, sources.models, sources.scenery_digest)
+        make_folder(out)
     with locked(out, execution.part.name if execution.part else None):
+        with in_turn(out):  # parts that begin at the same moment must be parts of one recipe
+            dataset = DatasetStore.open(out, recipe, sources.models, sources.scenery_digest)
         missing = wanted(dataset, execution.part)
-        failures: list[Outcome] = []
+        failures = list[DropResult]()
         try:
             if missing:
                 failures = _make(dataset, sources, missing, execution)
-        except BaseException:  # an interrupted dataset can be looked at, too
-            dataset.assemble()
+        except BaseException:
+            with suppress(UserError):  # an interrupted dataset can be looked at, too; the first error is told
+                dataset.assemble()
             raise
         dataset.finish()
         summary = _summarise(dataset, len(missing) - len(wanted(dataset, execution.part)), failures)
@@ -117,7 +121,7 @@ def wanted(dataset: DatasetStore, part: Part | None) -> list[int]:
     return [number for number in dataset.missing() if part is None or part.takes(plan_image(number, views).drop)]
 
 
-def redo(out: Path, drop: int, textures: str | None = None) -> int:
+def retry(out: Path, drop: int, textures: str | None = None) -> int:
     """Make the images of one drop again in this process, with all cores, and put them where they are missing.
 
     Args:
@@ -136,32 +140,34 @@ def redo(out: Path, drop: int, textures: str | None = None) -> int:
     if textures is not None:
         recipe = recipe.model_copy(update={"source": recipe.source.model_copy(update={"textures": textures})})
     sources = load_sources(recipe)
-    dataset = DatasetStore.open(out, recipe, sources.models, sources.scenery_digest)
-    views = recipe.camera.views_per_drop
-    plans = [plan_image(number, views) for number in range(drop * views, min((drop + 1) * views, recipe.images))]
-    if not plans:
-        raise UserError(f"{out}: has no drop {drop}; its {recipe.images} images show the drops from 0 on")
     with locked(out):
-        for image in Studio(recipe, sources).make(drop, plans):
+        dataset = DatasetStore.open(out, recipe, sources.models, sources.scenery_digest)
+        views, images = recipe.camera.views_per_drop, dataset.recipe.images
+        plans = [plan_image(number, views) for number in range(drop * views, min((drop + 1) * views, images))]
+        if not plans:
+            raise UserError(f"{out}: has no drop {drop}; its {images} images show the drops from 0 on")
+        for image in DropRenderer(recipe, sources).make(drop, plans):
             dataset.commit(image)
         (out / FAILURES_FOLDER / f"{drop:08d}.json").unlink(missing_ok=True)
         dataset.finish()
     return len(plans)
 
 
-def _make(dataset: DatasetStore, sources: Sources, missing: list[int], execution: Execution) -> list[Outcome]:
+def _make(dataset: DatasetStore, sources: Sources, missing: list[int], execution: Execution) -> list[DropResult]:
     """Make the missing images; return the drops that failed, in their order."""
-    failures: list[Outcome] = []
-    jobs = [Job(drop, tuple(images)) for drop, images in by_drop(missing, dataset.recipe.camera.views_per_drop)]
+    failures: list[DropResult] = []
+    views = dataset.recipe.camera.views_per_drop
+    tasks = (DropTask(drop, tuple(images)) for drop, images in by_drop(missing, views))
     interval = 0.5 if sys.stderr.isatty() else 60.0
     next_sheet: float = 1 if execution.preview_every else math.inf
-    with tqdm(total=len(missing), unit="image", mininterval=interval, maxinterval=interval, smoothing=0.05) as bar:
+    bar = tqdm(total=len(missing), unit="image", mininterval=interval, maxinterval=interval, smoothing=0.05)
+    with bar, closing(_results(dataset, tasks, execution)) as results:  # closed: no worker continues after an error
         assembled = time.monotonic()
-        for outcome in _outcomes(dataset, jobs, execution):
-            bar.update(outcome.made)
-            _note_failure(dataset, sources, outcome)
-            if outcome.failure:
-                failures.append(outcome)
+        for result in results:
+            bar.update(result.made)
+            _note_failure(dataset, sources, result)
+            if result.failure:
+                failures.append(result)
                 bar.set_postfix(failed=len(failures))
             if bar.n >= next_sheet or time.monotonic() - assembled > _BETWEEN_ASSEMBLIES_S:
                 dataset.assemble()
@@ -169,14 +175,16 @@ def _make(dataset: DatasetStore, sources: Sources, missing: list[int], execution
             if bar.n >= next_sheet:
                 _draw_sheet(dataset)
                 next_sheet = bar.n + execution.preview_every
-    return sorted(failures, key=lambda outcome: outcome.job.drop)
+    return sorted(failures, key=lambda result: result.task.drop)
 
 
-def _outcomes(dataset: DatasetStore, jobs: list[Job], execution: Execution) -> Iterator[Outcome]:
-    place = Workplace(dataset.recipe, dataset.root, execution.threads, execution.drop_limit_s, execution.devices)
+def _results(
+    dataset: DatasetStore, tasks: Iterable[DropTask], execution: Execution
+) -> Generator[DropResult, None, None]:
+    config = WorkerConfig(dataset.recipe, dataset.root, execution.threads, execution.drop_limit_s, execution.devices)
     if execution.cluster is not None:
-        return cluster.run(jobs, place, execution.cluster, execution.workers)
-    return executors.run(jobs, place, min(execution.processes, len(jobs)))
+        return ray_executor.run(tasks, config, execution.cluster, execution.workers)
+    return executors.run(tasks, config, execution.processes)
 
 
 def _draw_sheet(dataset: DatasetStore) -> None:
@@ -185,18 +193,18 @@ def _draw_sheet(dataset: DatasetStore) -> None:
             write_contact_sheet(dataset.root, dataset.root / SHEET_FILE, dataset.recipe.split)
 
 
-def _note_failure(dataset: DatasetStore, sources: Sources, outcome: Outcome) -> None:
+def _note_failure(dataset: DatasetStore, sources: Sources, result: DropResult) -> None:
     """Leave a note of a failed drop with the scene that it began with; take away that of one that went well."""
-    drop, recipe = outcome.job.drop, dataset.recipe
+    drop, recipe = result.task.drop, dataset.recipe
     path = dataset.root / FAILURES_FOLDER / f"{drop:08d}.json"
-    if outcome.failure:
+    if result.failure:
         scene = sample_scene(recipe, sources.catalogue, recipe.seed, drop)
-        write_json(path, {"drop": drop, "failure": outcome.failure, "scene": asdict(scene)})
+        write_json(path, {"drop": drop, "failure": result.failure, "scene": asdict(scene)})
     else:
         path.unlink(missing_ok=True)
 
 
-def _summarise(dataset: DatasetStore, made: int, failures: list[Outcome]) -> Summary:
+def _summarise(dataset: DatasetStore, made: int, failures: list[DropResult]) -> Summary:
     images, fractions = 0, []
     made_any = (dataset.root / dataset.recipe.split).is_dir()
     for scene_id in scene_ids(dataset.root, dataset.recipe.split) if made_any else []:
@@ -205,6 +213,7 @@ def _summarise(dataset: DatasetStore, made: int, failures: list[Outcome]) -> Sum
         fractions += [entry["visib_fract"] for entries in infos.values() for entry in entries]
     mean = sum(fractions) / len(fractions) if fractions else 0.0
     told = tuple(
-        f"drop {o.job.drop}: {o.failure}; try it alone: synthetless redo {dataset.root} {o.job.drop}" for o in failures
+        f"drop {result.task.drop}: {result.failure}; try it alone: synthetless redo {dataset.root} {result.task.drop}"
+        for result in failures
     )
     return Summary(images, len(fractions), made, mean, told)

@@ -15,9 +15,8 @@ from synthetless.errors import UserError
 from synthetless.generation.sources import models_folder
 from synthetless.io.color import tonemap
 from synthetless.io.models import ObjectModel, load_models
-from synthetless.scenes.mesh import Mesh
-from synthetless.scenes.render import Stage
-from synthetless.scenes.spec import Role, SceneSpec
+from synthetless.scenes.render import BlenderSession
+from synthetless.scenes.spec import Mesh, Role, SceneSpec
 
 
 def render_again(dataset: Path, scene_id: int, im_id: int, textures: Path | None = None) -> NDArray[np.uint8]:
@@ -44,10 +43,10 @@ def render_again(dataset: Path, scene_id: int, im_id: int, textures: Path | None
     image = recorded[im_id]
     if textures is None and recipe.source.textures != BUILTIN:
         textures = Path(recipe.source.textures)
-    stage = Stage(
+    session = BlenderSession(
         _meshes(dataset, recipe, image.scene), recipe.intrinsics, recipe.render, recipe.table.size_m, textures
     )
-    with stage.scene(image.scene, image.settled) as scene:
+    with session.scene(image.scene, image.settled) as scene:
         return tonemap(scene.render(image.view), image.exposure_gain)
 
 

@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import socket
+import stat
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -138,14 +139,24 @@ def read_json_lines(path: Path) -> list[Any]:
     return [_parse(line, f"{path}, line {number}") for number, line in enumerate(lines, start=1)]
 
 
-def read_bytes(path: Path) -> bytes:
-    """The content of a file.
+def read_bytes(path: Path, at_most: int | None = None) -> bytes:
+    """The content of a regular file.
+
+    Args:
+        path: of the file, or of a link to one.
+        at_most: its largest size.
 
     Raises:
-        UserError: it is missing or unreadable.
+        UserError: it is missing, unreadable, larger, or something else, such as a pipe that never ends.
     """
     try:
-        return path.read_bytes()
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:  # no waiting at a pipe
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise UserError(f"{path}: is no regular file")
+            if at_most is not None and status.st_size > at_most:
+                raise UserError(f"{path}: has {status.st_size} bytes; at most {at_most} are read")
+            return file.read()
     except FileNotFoundError:
         raise UserError(f"{path}: not found") from None
     except OSError as error:
@@ -161,17 +172,26 @@ def _line(path: Path, value: Any) -> str:
 
 def _parse(data: bytes, place: str) -> Any:
     try:
-        return json.loads(data, object_pairs_hook=_unique)
+        return json.loads(data, object_pairs_hook=unique_keys)
+    except RecursionError:
+        raise UserError(f"{place}: is nested too deeply") from None
     except ValueError as error:  # JSONDecodeError, UnicodeDecodeError and the hook's own
         raise UserError(f"{place}: not valid JSON, cut off or damaged ({error})") from None
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """For ``json.loads``: an object, a ValueError if it names a key twice."""
     content = dict(pairs)
     if len(content) < len(pairs):
         keys = [key for key, _ in pairs]
         raise UserError(f'key "{next(key for key in keys if keys.count(key) > 1)}" occurs twice')
     return content
+
+
+def nearest_existing(folder: Path) -> Path:
+    """The folder itself, or the innermost of its parents that exists."""
+    absolute = folder.absolute()
+    return next(place for place in (absolute, *absolute.parents) if place.is_dir())
 
 
 class LockedError(UserError):
@@ -213,21 +233,45 @@ def in_turn(root: Path) -> Iterator[None]:
             continue
 
 
+def user_folder() -> Path:
+    """This user's own folder among the temporary files of this machine; what is in it may be deleted at any time.
+
+    Raises:
+        UserError: it cannot be made; or it is somebody else's, or open to others, who could put files of theirs there.
+    """
+    folder = Path(tempfile.gettempdir()) / f"synthetless-{os.getuid()}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be used ({error.strerror}); remove it, or set TMPDIR") from None
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise UserError(f"{folder}: must be a folder of yours with mode 0700, no link; remove it, or set TMPDIR")
+    return folder
+
+
 def claim(name: str) -> int:
     """Take the first number, counted from 0, that no other process of this user on this machine has taken.
 
     It is given back when this process ends, however that comes about.
+
+    Raises:
+        UserError: the user's folder among the temporary files cannot be used.
     """
-    folder = Path(tempfile.gettempdir()) / f"synthetless-{os.getuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
+    folder = user_folder()
     for number in count():
-        lock = os.open(folder / f"{name}-{number}.lock", os.O_CREAT | os.O_RDWR, 0o600)
+        path = folder / f"{name}-{number}.lock"
+        try:
+            lock = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o600)
+        except OSError as error:
+            raise UserError(f"{path}: cannot be written ({error.strerror})") from None
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the descriptor is open
-        except OSError:
-            os.close(lock)
-        else:
             return number
+        except BlockingIOError:
+            os.close(lock)
+        except OSError as error:
+            raise UserError(f"{path}: cannot be locked ({error.strerror}); set TMPDIR to another folder") from None
     raise AssertionError("there are always more numbers")
 
 
@@ -242,12 +286,20 @@ def _flock(path: Path, mode: int, busy: str) -> Iterator[None]:
         try:
             fcntl.flock(lock, mode)
             taken_away = not os.path.samestat(path.stat(), os.fstat(lock.fileno()))
-        except OSError:
+        except BlockingIOError:
             raise LockedError(busy) from None
+        except FileNotFoundError:
+            taken_away = True
+        except OSError as error:
+            raise UserError(
+                f"{path}: this file system cannot lock files ({error.strerror}); "
+                "give a folder on another one, or mount it with locks (Lustre: -o flock)"
+            ) from None
         if taken_away:
             raise LockedError(busy)
         try:
             yield
         finally:
             if mode & fcntl.LOCK_EX:
-                path.unlink(missing_ok=True)
+                with suppress(OSError):  # the folder may have become read-only; the file alone locks nobody out
+                    path.unlink()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,6 +14,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from synthetless.errors import UserError
+from synthetless.io.documents import shown
+from synthetless.io.files import read_json
 
 INFO_FILE = "models_info.json"
 _PLY_NAME = re.compile(r"obj_(\d{6})\.ply")
@@ -93,18 +94,25 @@ def read_models_info(folder: Path) -> dict[int, dict[str, Any]]:
     """models_info.json by object id.
 
     Raises:
-        ModelError: it is missing, no JSON, or not a mapping of ids to entries.
+        ModelError: it is missing, not JSON, names a key twice, or is not a mapping of ids to entries.
     """
     path = folder / INFO_FILE
+    if not path.exists():
+        raise ModelError(f"{path}: not found; a BOP models folder needs it")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return {int(key): dict(entry) for key, entry in content.items()}
-    except FileNotFoundError:
-        raise ModelError(f"{path}: not found; a BOP models folder needs it") from None
-    except OSError as error:
-        raise ModelError(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, TypeError, AttributeError) as error:
-        raise ModelError(f"{path}: not a JSON object of object ids and entries ({error})") from None
+        content = read_json(path)
+    except UserError as error:
+        raise ModelError(str(error)) from None
+    entries: dict[int, dict[str, Any]] = {}
+    for key, entry in content.items():
+        if not (key.strip().isascii() and key.strip().isdecimal()):
+            raise ModelError(f'{path}: the key {shown(key)} is not an object id, such as "1"')
+        if not isinstance(entry, dict):
+            raise ModelError(f"{path}: object {key} is {shown(entry)}, not a mapping of diameter, box and symmetries")
+        if int(key) in entries:
+            raise ModelError(f"{path}: object {int(key)} is listed twice, once as {shown(key)}")
+        entries[int(key)] = entry
+    return entries
 
 
 def _find_meshes(folder: Path) -> dict[int, Path]:

@@ -8,6 +8,9 @@ Structured poses (an upright part seen from the side) lie exactly on such faces,
 differently for poses that look the same. All distances are therefore measured as if the reference were turned by a
 generic rotation of about `tie_epsilon`. It is the same for all anchors, so the whole atlas, margins included, is
 merely seen in a camera frame that is turned by as much.
+
+By chance two charts may be equally wide there, too. Of charts whose clearances differ by less than `noise`, which is
+what the rounding of the poses explains, the first is taken.
 """
 
 from __future__ import annotations
@@ -112,7 +115,7 @@ class FiniteCharts:
             margin, which therefore never jumps. `hemisphere`: the nearest of the first half of the anchors while the
             axis is tilted from the reference by at most 90 degrees, else of the second half; the margin steps there.
         axis: the main axis, for the rule `hemisphere`.
-        tie_epsilon: see the module.
+        tie_epsilon, noise: see the module.
     """
 
     elements_wxyz: Floats
@@ -120,6 +123,7 @@ class FiniteCharts:
     rule: Rule
     axis: Floats
     tie_epsilon: float
+    noise: float
 
     @cached_property
     def _deciding(self) -> Floats:
@@ -171,7 +175,7 @@ class FiniteCharts:
             axis=1,
         )
         rows = np.arange(len(q))
-        index = np.argmax(clearances, axis=1)
+        index = np.argmax(clearances >= clearances.max(axis=1, keepdims=True) - self.noise, axis=1)
         canonical = multiply(q, self.elements_wxyz[elements[rows, index]])
         return Labels(canonical, index, self._margin_deg(clearances[rows, index]))
 

@@ -7,6 +7,7 @@ motion of the model it is x -> S x + (1 - S) c.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,9 +18,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from synthetless.errors import UserError
-from synthetless.symmetry.frames import frame_of_axes, frame_of_axis, signed_axis
 from synthetless.symmetry.from_bop import recognise
-from synthetless.symmetry.point_groups import Family, GroupName, X, Z, parse_name, standard_elements
+from synthetless.symmetry.point_groups import (
+    Family,
+    GroupName,
+    X,
+    Z,
+    frame_of_axes,
+    frame_of_axis,
+    parse_name,
+    signed_axis,
+    standard_elements,
+)
 from synthetless.symmetry.quaternions import (
     IDENTITY,
     Floats,
@@ -32,6 +42,8 @@ from synthetless.symmetry.quaternions import (
     rotate,
     to_matrix,
 )
+
+_log = logging.getLogger(__name__)
 
 Vector = tuple[float, float, float]
 
@@ -112,17 +124,22 @@ class SymmetryGroup:
         )
 
     @classmethod
-    def from_bop(cls, info: Mapping[str, Any]) -> Self:
+    def from_bop(cls, info: Mapping[str, Any], what: str = "models_info.json") -> Self:
         """The closed group of an entry of BOP's `models_info.json`; without symmetry fields the trivial one.
 
         Its frame is the one nearest to the model frame, whatever generators the file lists, in whatever order.
+        Rotations of low orders that are off by more than rounding are snapped, with a warning in the log that begins
+        with `what`.
 
         Raises:
-            UserError: a reflection or another non-rotation, numbers that are not finite, a zero axis, more than 120
-                elements, or motions without a common fixed point.
+            UserError: a reflection or another non-rotation, numbers that are not finite, a zero axis, rotations that
+                fit no group of at most 120 elements or more than one, motions without a common fixed point, or a
+                misspelt field.
         """
-        name, frame, offset = recognise(info)
-        text = f"{name.family}{name.n}" if name.n else name.family
+        name, frame, offset, remarks = recognise(info)
+        for remark in remarks:
+            _log.warning("%s: %s", what, remark)
+        text = name.text
         if text in ("C1", "SO(3)"):
             return cls(text, offset_mm=_tuple(np.round(offset, 9)))
         axes = np.round(rotate(frame, np.stack([Z, X])), 12)  # a file says 4e-14 where it means 0
@@ -159,7 +176,7 @@ class SymmetryGroup:
     @property
     def order(self) -> float:
         """The number of elements: a whole number, or `math.inf`."""
-        return len(self._discrete_wxyz) if self.is_finite else math.inf
+        return parse_name(self.name).order
 
     @cached_property
     def frame_wxyz(self) -> Floats:

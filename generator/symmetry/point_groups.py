@@ -1,4 +1,4 @@
-"""The rotation groups a rigid object can have, each in its standard frame, and their names.
+"""The rotation groups a rigid object can have, their names, and the standard frame each is given in.
 
 Standard frame: main axis z, a 2-fold axis of D_n along x; T, O and I have their 2-fold (T, I) or 4-fold (O) axes along
 x, y and z and a 3-fold axis along (1, 1, 1); I has a 5-fold axis along (0, 1, (1 + sqrt 5) / 2).
@@ -7,13 +7,22 @@ x, y and z and a 3-fold axis along (1, 1, 1); I has a 5-fold axis along (0, 1, (
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from synthetless.errors import UserError
-from synthetless.symmetry.quaternions import IDENTITY, Floats, from_axis_angle, multiply
+from synthetless.symmetry.quaternions import (
+    IDENTITY,
+    Floats,
+    from_axis_angle,
+    from_matrix,
+    minimal,
+    multiply,
+    normalise,
+)
 
 Family = Literal["C", "D", "T", "O", "I", "SO(2)", "O(2)", "SO(3)"]
 
@@ -28,6 +37,16 @@ class GroupName(NamedTuple):
 
     family: Family
     n: int
+
+    @property
+    def text(self) -> str:
+        """The name as it is written."""
+        return f"{self.family}{self.n}" if self.n else self.family
+
+    @property
+    def order(self) -> float:
+        """The number of elements, `math.inf` of a continuous group."""
+        return {"C": self.n, "D": 2 * self.n, "T": 12, "O": 24, "I": 60}.get(self.family, math.inf)
 
 
 def parse_name(name: object) -> GroupName:
@@ -98,3 +117,23 @@ def _products(left: Floats, right: Floats) -> Floats:
 def _tetrahedral() -> Floats:
     signs = np.array([[1, x, y, z] for x in (1, -1) for y in (1, -1) for z in (1, -1)])
     return np.concatenate([np.eye(4), signs / 2])
+
+
+def signed_axis(axis: Floats) -> Floats:
+    """The axis or its opposite: the one whose last component that is not nearly zero is positive.
+
+    Both describe the same group; one sign makes the labels independent of how somebody wrote it.
+    """
+    last = next((value for value in axis[::-1] if abs(value) > 1e-3), 1.0)
+    return axis if last > 0 else -axis
+
+
+def frame_of_axis(axis: Floats) -> Floats:
+    """The smallest rotation (wxyz) that takes z to the axis, after its sign is settled."""
+    return minimal(Z, signed_axis(axis))
+
+
+def frame_of_axes(axis: Floats, secondary_axis: Floats) -> Floats:
+    """The rotation (wxyz) that takes z to `axis` and x to the part of `secondary_axis` perpendicular to it."""
+    x = normalise(secondary_axis - (secondary_axis @ axis) * axis)
+    return np.asarray(from_matrix(np.stack([x, np.cross(axis, x), axis], axis=1)[None])[0])

@@ -18,6 +18,7 @@ Floats = NDArray[np.float64]
 
 IDENTITY: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 MAX_DEFECT = 1e-2  # Frobenius distance of a matrix from the nearest rotation that still counts as rounding
+_NEARLY_OPPOSITE = 1e-2  # length of the sum of two unit vectors below which 1 + u.v has lost its last four digits
 
 
 def multiply(p: Floats, q: Floats) -> Floats:
@@ -54,9 +55,18 @@ def from_axis_angle(axis: ArrayLike, angle_rad: ArrayLike) -> Floats:
 
 
 def minimal(u: Floats, v: Floats) -> Floats:
-    """The smallest rotations (..., 4) taking unit vectors u to unit vectors v, both (..., 3) and not opposite."""
+    """The smallest rotations (..., 4) taking unit vectors u to unit vectors v, both (..., 3) and not opposite.
+
+    (1 + u.v, u x v), normalised. Near v = -u both parts lose their digits; there |u + v| / 2 is the cosine of half the
+    angle and u x (u + v) the axis, in which nothing cancels.
+    """
     u, v = np.broadcast_arrays(u, v)
-    return normalise(np.concatenate([1 + np.sum(u * v, axis=-1, keepdims=True), cross(u, v)], axis=-1))
+    rotations = normalise(np.concatenate([1 + np.sum(u * v, axis=-1, keepdims=True), cross(u, v)], axis=-1))
+    together = np.linalg.norm(u + v, axis=-1)
+    if (near := together < _NEARLY_OPPOSITE).any():
+        half, axis = together[near][:, None] / 2, cross(u[near], u[near] + v[near])
+        rotations[near] = normalise(np.concatenate([half, axis / (2 * half)], axis=-1))
+    return rotations
 
 
 def rotate(q: Floats, v: Floats) -> Floats:

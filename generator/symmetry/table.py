@@ -6,9 +6,9 @@ By hand (YAML or JSON):
     object 27: {group: C4}
     object 31: {group: D3, axis: [0, 0, 1], secondary_axis: [1, 0, 0]}
 
-As `symmetries.json` beside a dataset: {"scheme", "allocentric", "objects": {id: entry}}, where an entry also says what
-follows from the group: order ("inf" for a continuous one), n_regressors, anchors (unit quaternions wxyz, in the role of
-`R_m2c`), separation_deg.
+As `symmetries.json` beside a dataset: {"scheme", "allocentric", "objects": {id: entry}}, and "decimals" if the poses
+that are labelled were rounded to less than 15 of them. An entry also says what follows from the group: order ("inf" for
+a continuous one), n_regressors, anchors (unit quaternions wxyz, in the role of `R_m2c`), separation_deg.
 """
 
 from __future__ import annotations
@@ -17,25 +17,29 @@ import difflib
 import hashlib
 import json
 import re
-from collections.abc import Hashable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
-import yaml
 
 from synthetless.errors import UserError
-from synthetless.io.files import atomic_write, read_bytes
-from synthetless.symmetry.atlas import SCHEMES, Scheme
-from synthetless.symmetry.canonical import CanonicalMap
+from synthetless.io.documents import read_document, shown
+from synthetless.io.files import atomic_write
+from synthetless.symmetry.atlas import SCHEMES, Scheme, former_anchors
+from synthetless.symmetry.canonical import FULL_DECIMALS, CanonicalMap, check_decimals
 from synthetless.symmetry.groups import SymmetryGroup
+from synthetless.symmetry.point_groups import parse_name
 
 Matrix = tuple[tuple[float, ...], ...]
 
-_TABLE_KEYS = ("scheme", "allocentric", "objects")
+TABLE_FILE = "symmetries.json"
+MODELS_INFO_FILE = "models_info.json"
+
+TABLE_KEYS = ("scheme", "allocentric", "decimals", "objects")
+
 _GIVEN_KEYS = ("group", "axis", "secondary_axis", "frame", "offset", "offset_mm", "reference_rotation")
 _DERIVED_KEYS = ("order", "n_regressors", "anchors", "separation_deg")
 _BOP_SIZES = tuple(f"{what}_{axis}" for what in ("min", "max", "size") for axis in "xyz")
@@ -55,7 +59,7 @@ class SymmetryEntry:
     group: SymmetryGroup
     reference_rotation: Matrix | None = None
 
-    def canonical_map(self, scheme: Scheme, allocentric: bool = False, decimals: int = 9) -> CanonicalMap:
+    def canonical_map(self, scheme: Scheme, allocentric: bool = False, decimals: int = FULL_DECIMALS) -> CanonicalMap:
         """The map that labels this object's poses."""
         return CanonicalMap(self.group, scheme, self.reference_rotation, allocentric, decimals)
 
@@ -68,34 +72,61 @@ class SymmetryTable:
         entries: by object id, ascending.
         scheme: `pitteri2019` or `atlas`.
         allocentric: whether rotations are judged relative to the ray to the object (see `CanonicalMap`).
+        decimals: with how many the poses that are labelled are stored (see `CanonicalMap`).
     """
 
     entries: Mapping[int, SymmetryEntry]
     scheme: Scheme = "pitteri2019"
     allocentric: bool = False
+    decimals: int = FULL_DECIMALS
 
     def __post_init__(self) -> None:
+        check_decimals(self.decimals)
         _check_scheme(self.scheme)
         ordered = {obj_id: self.entries[obj_id] for obj_id in sorted(self.entries)}
         object.__setattr__(self, "entries", MappingProxyType(ordered))
 
     @classmethod
-    def from_models_info(
-        cls, models_info: Mapping[Any, Mapping[str, Any]], scheme: Scheme = "pitteri2019", allocentric: bool = False
-    ) -> Self:
+    def from_models_info(cls, models_info: object, scheme: Scheme = "pitteri2019", allocentric: bool = False) -> Self:
         """The table of the groups that BOP's `models_info.json` declares (keys: object ids as int or str).
 
         Raises:
             UserError: an entry that describes no rotation group, with the object's id.
         """
-        entries = {}
-        for key, info in models_info.items():
-            obj_id = _object_id(key)
-            try:
-                entries[obj_id] = SymmetryEntry(SymmetryGroup.from_bop(info))
-            except ValueError as error:
-                raise UserError(f"object {obj_id}: {error}") from error
-        return cls(entries, scheme, allocentric)
+        declared, faults = cls.declared(models_info, scheme=scheme, allocentric=allocentric)
+        if faults:
+            raise UserError(next(iter(faults.values())))
+        return declared
+
+    @classmethod
+    def declared(
+        cls,
+        models_info: object,
+        but: Collection[int] = (),
+        scheme: Scheme = "pitteri2019",
+        allocentric: bool = False,
+    ) -> tuple[Self, dict[int, str]]:
+        """The table of those groups in BOP's `models_info.json` that can be read, and what is wrong with the others.
+
+        Args:
+            models_info: the file's content.
+            but: objects whose entries are not looked at.
+            scheme, allocentric: of the table.
+
+        Returns:
+            The table, and one line for each object whose entry describes no rotation group, by id.
+
+        Raises:
+            UserError: it is not a mapping of object ids to entries, or names an object twice.
+        """
+        entries, faults = {}, {}
+        for obj_id, info in _by_id(models_info, f"{MODELS_INFO_FILE} maps object ids to diameters and boxes").items():
+            if obj_id not in but:
+                try:
+                    entries[obj_id] = SymmetryEntry(SymmetryGroup.from_bop(info, f"object {obj_id}"))
+                except UserError as error:
+                    faults[obj_id] = f"object {obj_id}: {error}"
+        return cls(entries, scheme, allocentric), faults
 
     @classmethod
     def from_dict(cls, data: object) -> Self:
@@ -110,39 +141,38 @@ class SymmetryTable:
             raise UserError(
                 "a symmetry table is a mapping of objects, such as 'object 26: {group: C2, axis: [0, 0, 1]}'"
             )
-        objects = data.get("objects", {key: value for key, value in data.items() if key not in _TABLE_KEYS})
+        objects = data.get("objects", {key: value for key, value in data.items() if key not in TABLE_KEYS})
         if "objects" in data:
-            _refuse_unknown(data, _TABLE_KEYS, "the symmetry table")
-        if not isinstance(objects, Mapping):
-            raise UserError(f"objects is {objects!r}, not a mapping of object ids to groups")
+            _refuse_unknown(data, TABLE_KEYS, "the symmetry table")
         scheme, allocentric = data.get("scheme", SCHEMES[0]), data.get("allocentric", False)
         _check_scheme(scheme)
         if not isinstance(allocentric, bool):
-            raise UserError(f"allocentric is {allocentric!r}, not true or false")
-        entries: dict[int, SymmetryEntry] = {}
-        for key, value in objects.items():
-            obj_id = _object_id(key)
-            if obj_id in entries:
-                raise UserError(f"object {obj_id} is listed twice")
+            raise UserError(f"allocentric is {shown(allocentric)}, not true or false")
+        entries = {}
+        by_id = _by_id(objects, f"objects is {shown(objects)}, not a mapping of object ids to groups")
+        for obj_id, value in by_id.items():
             try:
-                entries[obj_id] = _entry(value, scheme)
-            except ValueError as error:
+                entries[obj_id] = _entry(value, scheme, f"object {obj_id}")
+            except UserError as error:
                 raise UserError(f"object {obj_id}: {error}") from error
-        return cls(entries, scheme, allocentric)
+        return cls(entries, scheme, allocentric, data.get("decimals", FULL_DECIMALS))
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """The table in a YAML or JSON file.
+        """The table in a YAML or JSON file, in BOP's `models_info.json`, or in a folder that holds one of these.
+
+        Of a folder `symmetries.json` is taken, or else `models_info.json`.
 
         Raises:
-            UserError: the file cannot be read, is neither JSON nor YAML, or what `from_dict` refuses; with the file's
-                name.
+            UserError: the file cannot be found or read, is neither JSON nor YAML, or what `from_dict` refuses; with
+                the file's name.
         """
-        data = read_bytes(Path(path))
+        file = _file_of(Path(path))
+        content = read_document(file)
         try:
-            return cls.from_dict(_parsed(data.decode()))
-        except ValueError as error:
-            raise UserError(f"{path}: {error}") from error
+            return cls.from_models_info(content) if file.name == MODELS_INFO_FILE else cls.from_dict(content)
+        except UserError as error:
+            raise UserError(f"{file}: {error}") from error
 
     def write(self, path: str | Path) -> None:
         """Write the table as JSON (which is YAML as well), always the same bytes, whole or not at all.
@@ -150,21 +180,25 @@ class SymmetryTable:
         Raises:
             UserError: the file cannot be written.
         """
-        head = [f'"scheme": {json.dumps(self.scheme)}', f'"allocentric": {json.dumps(self.allocentric)}']
-        lines = [f"  {json.dumps(key)}: {json.dumps(entry)}" for key, entry in self.to_dict()["objects"].items()]
+        content = self.to_dict()
+        head = [f'"{key}": {json.dumps(content[key])}' for key in content if key != "objects"]
+        lines = [f"  {json.dumps(key)}: {json.dumps(entry)}" for key, entry in content["objects"].items()]
         text = "{\n" + ",\n".join(head) + ',\n"objects": {\n' + ",\n".join(lines) + "\n}}\n"
         atomic_write(Path(path), text.encode(), durable=True)
 
     def to_dict(self) -> dict[str, Any]:
         """What `write` writes: plain dicts, lists and numbers."""
         objects = {str(obj_id): self._described(entry) for obj_id, entry in self.entries.items()}
-        return {"scheme": self.scheme, "allocentric": self.allocentric, "objects": objects}
+        head: dict[str, Any] = {"scheme": self.scheme, "allocentric": self.allocentric}
+        if self.decimals < FULL_DECIMALS:
+            head["decimals"] = self.decimals
+        return head | {"objects": objects}
 
     def digest(self) -> str:
         """SHA-256 (hex) of the table's canonical JSON: equal digests, equal labels."""
         return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
 
-    def canonical_map(self, obj_id: int, decimals: int = 9) -> CanonicalMap:
+    def canonical_map(self, obj_id: int) -> CanonicalMap:
         """The map that labels an object's poses.
 
         Raises:
@@ -172,7 +206,7 @@ class SymmetryTable:
         """
         if obj_id not in self.entries:
             raise UserError(f"object {obj_id} is not in the symmetry table, which has {_listed(self.entries)}")
-        return self.entries[obj_id].canonical_map(self.scheme, self.allocentric, decimals)
+        return self.entries[obj_id].canonical_map(self.scheme, self.allocentric, self.decimals)
 
     def _described(self, entry: SymmetryEntry) -> dict[str, Any]:
         group = entry.group
@@ -196,14 +230,27 @@ def _derived(entry: SymmetryEntry, scheme: Scheme) -> dict[str, Any]:
     }
 
 
-def _entry(value: object, scheme: Scheme) -> SymmetryEntry:
+def _by_id(objects: object, otherwise: str) -> dict[int, Any]:
+    """The values of a mapping by object id."""
+    if not isinstance(objects, Mapping):
+        raise UserError(otherwise)
+    by_id: dict[int, Any] = {}
+    for key, value in objects.items():
+        obj_id = _object_id(key)
+        if obj_id in by_id:
+            raise UserError(f"object {obj_id} is listed twice")
+        by_id[obj_id] = value
+    return by_id
+
+
+def _entry(value: object, scheme: Scheme, what: str) -> SymmetryEntry:
     if isinstance(value, str):
         return SymmetryEntry(SymmetryGroup.from_name(value))
     if not isinstance(value, Mapping):
-        raise UserError(f"{value!r} describes no symmetries; write for example {{group: C2, axis: [0, 0, 1]}}")
-    if value and value.keys() <= set(_BOP_KEYS):
-        return SymmetryEntry(SymmetryGroup.from_bop(value))
-    _refuse_unknown(value, _GIVEN_KEYS + _DERIVED_KEYS, "it")
+        raise UserError(f"{shown(value)} describes no symmetries; write for example {{group: C2, axis: [0, 0, 1]}}")
+    if "group" not in value and not value.keys().isdisjoint(_BOP_KEYS):
+        return SymmetryEntry(SymmetryGroup.from_bop(value, what))
+    _refuse_unknown(value, _GIVEN_KEYS + _DERIVED_KEYS, "it", suggested=_BOP_KEYS)
     if "group" not in value:
         raise UserError("it has no group; write for example {group: C2, axis: [0, 0, 1]}")
     if "offset" in value and "offset_mm" in value:
@@ -217,7 +264,7 @@ def _entry(value: object, scheme: Scheme) -> SymmetryEntry:
         frame=value.get("frame"),
     )
     entry = SymmetryEntry(group, _reference(value.get("reference_rotation")))
-    _check_derived(value, _derived(entry, scheme))
+    _check_derived(value, entry, scheme)
     return entry
 
 
@@ -229,17 +276,27 @@ def _reference(value: object) -> Matrix | None:
     except (TypeError, ValueError):
         matrix = np.empty(0)
     if matrix.size != 9:
-        raise UserError(f"reference_rotation is {value!r}, not 3 rows of 3 numbers")
+        raise UserError(f"reference_rotation is {shown(value)}, not 3 rows of 3 numbers")
     rows = matrix.reshape(3, 3)
     CanonicalMap(SymmetryGroup.trivial(), reference_rotation=rows)  # refuses what is no rotation
     return tuple(tuple(float(number) for number in row) for row in rows)
 
 
-def _check_derived(given: Mapping[Any, Any], expected: Mapping[str, Any]) -> None:
+def _check_derived(given: Mapping[Any, Any], entry: SymmetryEntry, scheme: Scheme) -> None:
     """A file whose group was edited must not keep saying what followed from the former one."""
-    for key in _DERIVED_KEYS:
-        if key in given and not _agree(given[key], expected[key]):
-            raise UserError(f"{key} does not follow from the group and scheme: leave {', '.join(_DERIVED_KEYS)} out")
+    expected = _derived(entry, scheme)
+    wrong = [key for key in _DERIVED_KEYS if key in given and not _agree(given[key], expected[key])]
+    if wrong and not _is_of_earlier_version(given, wrong, entry, scheme):
+        raise UserError(f"{wrong[0]} does not follow from the group and scheme: leave {', '.join(_DERIVED_KEYS)} out")
+
+
+def _is_of_earlier_version(given: Mapping[Any, Any], wrong: list[str], entry: SymmetryEntry, scheme: Scheme) -> bool:
+    """Whether the file was right when it was written: its group stands, only its labels have to be made again."""
+    if scheme != "pitteri2019" or not {"anchors"} <= set(wrong) <= {"anchors", "separation_deg"}:
+        return False
+    return _agree(
+        given["anchors"], entry.canonical_map(scheme).placed_wxyz(former_anchors(parse_name(entry.group.name)))
+    )
 
 
 def _agree(a: object, b: object) -> bool:
@@ -255,19 +312,32 @@ def _agree(a: object, b: object) -> bool:
 def _object_id(key: object) -> int:
     matched = _OBJECT_KEY.fullmatch(str(key).strip())
     if matched is None:
-        raise UserError(f"{key!r} names no object: write 'object 26' or 26{_suggestion(str(key), _TABLE_KEYS)}")
+        raise UserError(f"{key!r} names no object: write 'object 26' or 26{_suggestion(str(key), TABLE_KEYS)}")
     return int(matched[1])
 
 
-def _refuse_unknown(mapping: Mapping[Any, Any], known: Iterable[str], where: str) -> None:
+def _refuse_unknown(
+    mapping: Mapping[Any, Any], known: Sequence[str], where: str, suggested: Sequence[str] = ()
+) -> None:
     for key in mapping:
         if key not in known:
-            raise UserError(f"{where} has the unknown key {str(key)!r}{_suggestion(str(key), known)}")
+            raise UserError(f"{where} has the unknown key {str(key)!r}{_suggestion(str(key), [*known, *suggested])}")
 
 
 def _suggestion(word: str, known: Iterable[str]) -> str:
     nearest = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
     return f": did you mean {nearest[0]!r}?" if nearest else ""
+
+
+def _file_of(path: Path) -> Path:
+    if not path.is_dir():
+        return path
+    found = [path / name for name in (TABLE_FILE, MODELS_INFO_FILE) if (path / name).exists()]
+    if not found:
+        raise UserError(
+            f"{path}: holds neither {TABLE_FILE} nor {MODELS_INFO_FILE}; symmetries detect can write a table"
+        )
+    return found[0]
 
 
 def _check_scheme(scheme: object) -> None:
@@ -278,32 +348,3 @@ def _check_scheme(scheme: object) -> None:
 def _listed(ids: Iterable[int]) -> str:
     text = ", ".join(map(str, ids))
     return f"objects {text}" if text else "no objects"
-
-
-def _parsed(text: str) -> object:
-    # JSON first: YAML 1.1 reads 1e-06 as a word.
-    with suppress(json.JSONDecodeError):
-        return json.loads(text, object_pairs_hook=_unique)
-    try:
-        return yaml.load(text, Loader=_UniqueKeyLoader)
-    except yaml.YAMLError as error:
-        raise UserError(f"neither JSON nor YAML ({' '.join(str(error).split())})") from error
-
-
-def _unique(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
-    _refuse_repetition([key for key, _ in pairs])
-    return dict(pairs)
-
-
-def _refuse_repetition(keys: list[Any]) -> None:
-    for key in keys:
-        if keys.count(key) > 1:
-            raise UserError(f"{str(key)!r} is listed twice")
-
-
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """YAML that refuses a key given twice, of which plain YAML silently takes the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        _refuse_repetition([key.value for key, _ in node.value])
-        return super().construct_mapping(node, deep)

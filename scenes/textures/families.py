@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetless.scenes.textures import masonry, materials, prints, textiles
+from synthetless.scenes.textures import masonry, natural, prints, textiles
 from synthetless.scenes.textures.colour import LUMA, Image
 
 Painter = Callable[[np.random.Generator, int], Image]
@@ -16,19 +16,19 @@ Painter = Callable[[np.random.Generator, int], Image]
 PAINTERS: dict[str, Painter] = {
     painter.__name__: painter
     for painter in (
-        materials.wood_grain,
-        materials.wood_planks,
-        materials.cork,
-        materials.cardboard,
-        materials.leather,
-        materials.marble,
-        materials.granite,
-        materials.terrazzo,
-        materials.concrete,
-        materials.gravel,
-        materials.brushed_metal,
-        materials.tread_plate,
-        materials.peeling_paint,
+        natural.wood_grain,
+        natural.wood_planks,
+        natural.cork,
+        natural.cardboard,
+        natural.leather,
+        natural.marble,
+        natural.granite,
+        natural.terrazzo,
+        natural.concrete,
+        natural.gravel,
+        natural.brushed_metal,
+        natural.tread_plate,
+        natural.peeling_paint,
         masonry.tiles,
         masonry.bricks,
         masonry.hexagon_tiles,

@@ -12,14 +12,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from posed import random_camera, random_poses
+from scipy.spatial.transform import Rotation
 from trees import contents
 
 from synthetless.dataset.labels import label_scene
 from synthetless.dataset.layout import ScenePaths
 from synthetless.dataset.records import read_scene_json, write_scene_json
 from synthetless.dataset.relabel import adopt
+from synthetless.errors import UserError
 from synthetless.io.models import read_models_info
-from synthetless.symmetry import SymmetryTable
+from synthetless.symmetry import SymmetryGroup, SymmetryTable
 
 SCENES = {"train_primesense": (5, 26), "test_primesense": (1,), "train_pbr": (0, 1)}
 LABELS = {f"{split}/{scene:06d}/scene_gt_canonical.json" for split, scenes in SCENES.items() for scene in scenes}
@@ -146,6 +148,79 @@ def test_models_may_lie_elsewhere(bop: Path, tmp_path: Path) -> None:
     assert adopt(bop, workers=1).written == 0
 
 
+LINEMOD_HALF_TURN = [
+    *(-0.999633, 0.026679, 0.00479336, -0.262139, -0.0266744, -0.999644, 0.00100504, -0.197966),
+    *(0.00481847, 0.000876831, 0.999988, 0.0321652, 0, 0, 0, 1),
+]
+
+
+def _euler_grid(step_deg: int) -> np.ndarray:
+    """(N, 3, 3) rotations at which labels are tied."""
+    angles = np.stack(np.meshgrid(*[np.arange(0, 360, step_deg)] * 3), axis=-1).reshape(-1, 3)
+    return Rotation.from_euler("ZXZ", angles, degrees=True).as_matrix()
+
+
+def _lay_out(root: Path, models_info: dict[str, object], rotations: np.ndarray, obj_id: int = 10) -> ScenePaths:
+    """A dataset of one scene folder, an image for each rotation."""
+    scene = ScenePaths.of(root, 2, "test")
+    camera = random_camera(np.random.default_rng(0))
+    gt = {
+        im_id: [{"obj_id": obj_id, "cam_R_m2c": R.ravel().tolist(), "cam_t_m2c": [0.0, 0.0, 700.0]}]
+        for im_id, R in enumerate(rotations)
+    }
+    write_scene_json(scene.scene_gt, gt)
+    write_scene_json(scene.scene_camera, {im_id: {"cam_K": camera["cam_K"]} for im_id in gt})
+    (root / "models").mkdir()
+    (root / "models" / "models_info.json").write_text(json.dumps(models_info))
+    return scene
+
+
+def _info(**fields: object) -> dict[str, object]:
+    box = {f"{what}_{axis}": {"min": -30, "size": 60}[what] for what in ("min", "size") for axis in "xyz"}
+    return {"diameter": 100.0, **box, **fields}
+
+
+def test_linemod_is_adopted_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    infos = {"10": _info(symmetries_discrete=[LINEMOD_HALF_TURN])}
+    _lay_out(tmp_path, infos, _euler_grid(60))
+    assert adopt(tmp_path, workers=1).table.entries[10].group.name == "C2"
+    assert "object 10: symmetries_discrete are up to 1.53 degrees off C2" in caplog.text
+
+
+def test_an_object_that_is_named_or_does_not_occur_is_not_read(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    reflection = [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1]]
+    broken, snapped = _info(symmetries_discrete=reflection), _info(symmetries_discrete=[LINEMOD_HALF_TURN])
+    scene = _lay_out(tmp_path, {"10": snapped, "11": broken, "12": broken}, _euler_grid(60), obj_id=11)
+    with pytest.raises(UserError, match=r"models_info\.json: object 11: .*reflection.*--symmetries"):
+        adopt(tmp_path, workers=1)
+    assert not scene.scene_gt_canonical.exists()
+    caplog.clear()
+    table = tmp_path / "table.yaml"
+    table.write_text("10: C1\n11: {group: C3}")
+    adoption = adopt(tmp_path, symmetries=table, workers=1)
+    assert {obj_id: entry.group.name for obj_id, entry in adoption.table.entries.items()} == {10: "C1", 11: "C3"}
+    assert not caplog.messages
+
+
+@pytest.mark.parametrize("decimals", [4, 6, 8])
+def test_look_alikes_of_a_file_with_few_decimals_share_labels(tmp_path: Path, decimals: int) -> None:
+    """The precision is found in the poses, recorded beside the labels, and used by whoever recomputes them."""
+    group = SymmetryGroup.from_name("C3")
+    grid = _euler_grid(45)
+    rotations = np.concatenate([grid, grid @ group.motions()[1][:3, :3]]).round(decimals)
+    infos = {"10": _info(**group.to_bop())}
+    scene = _lay_out(tmp_path, infos, rotations)
+    adopt(tmp_path, workers=1)
+    assert json.loads((tmp_path / "symmetries.json").read_text())["decimals"] == decimals
+    labels = [entries[0] for entries in read_scene_json(scene.scene_gt_canonical).values()]
+    for one, other in zip(labels[: len(grid)], labels[len(grid) :], strict=True):
+        assert one["regressor_index"] == other["regressor_index"]
+        assert_allclose(one["cam_R_m2c_canonical"], other["cam_R_m2c_canonical"], atol=10 * 10.0**-decimals)
+    assert adopt(tmp_path, workers=1).written == 0
+
+
 def _cut(bop: Path, name: str) -> None:
     (bop / name).write_bytes((bop / name).read_bytes()[:-30])
 
@@ -183,7 +258,7 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "a foreign table": (
         lambda bop: (bop / "symmetries.json").write_text('{"1": "mine"}'),
-        r"symmetries\.json: is no symmetry table of synthetless",
+        r"symmetries\.json: not a symmetry table of synthetless",
     ),
     "a dataset of our own": (lambda bop: (bop / "dataset.json").write_text("{}"), "so use relabel"),
 }

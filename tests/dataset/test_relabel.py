@@ -291,6 +291,13 @@ def test_a_missing_file_is_named(root: Path, name: str) -> None:
     )
 
 
+def test_a_damaged_recipe_is_told_before_anything_is_written(root: Path) -> None:
+    header = read_json(root / "dataset.json")
+    header["recipe"]["camera"]["width"] = "wide"
+    (root / "dataset.json").write_text(json.dumps(header))
+    _assert_refused(root, lambda: relabel(root, scheme="atlas", workers=1), r"dataset\.json: its recipe is damaged")
+
+
 def test_a_pose_that_is_none_is_named(root: Path) -> None:
     path = root / SPLIT / "000002" / "scene_gt.json"
     gt = read_json(path)

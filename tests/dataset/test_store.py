@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import socket
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from synthetless.config import Recipe, load_recipe
 from synthetless.dataset import records
 from synthetless.dataset.layout import Part, by_drop, image_number, plan_image
 from synthetless.dataset.store import DatasetError, DatasetStore, FinishedImage
+from synthetless.errors import UserError
 from synthetless.io import images
 from synthetless.io.files import LockedError, in_turn, locked, read_json
 from synthetless.io.models import ObjectModel, load_models
@@ -101,8 +103,41 @@ def test_an_interrupted_assembly_is_made_good(
     scene = dataset.scene(1)
     (scene.root / lost).unlink()
     scene.scene_camera.unlink(missing_ok=True)
-    dataset.assemble()
+    DatasetStore(tmp_path / "d", recipe).assemble()
     assert contents(tmp_path / "d") == complete
+
+
+def test_assembling_does_not_read_again_what_is_finished(
+    tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = recipe.model_copy(update={"images": 3000})
+    dataset = DatasetStore.open(tmp_path / "d", recipe, models, "")
+    for number in (0, 1000, 2000):
+        dataset.commit(_image(number))
+    dataset.assemble()
+    read: list[Path] = []
+    monkeypatch.setattr("synthetless.dataset.store.read_json", lambda path: read.append(path) or read_json(path))
+    dataset.commit(_image(2001))
+    dataset.assemble()
+    assert {path.parent.name for path in read if path.parent.parent.name == ".records"} == {"000003"}
+    header = read_json(tmp_path / "d" / "dataset.json")
+    assert header["counts"] == {"images": 4, "instances": 4}
+    shutil.rmtree(tmp_path / "d" / "train_synthetless" / "000001")
+    dataset.finish()
+    assert len(records.read_scene_json(dataset.scene(1).scene_gt)) == 1, "in the end everything is looked at"
+
+
+@pytest.mark.parametrize("name", [".DS_Store", "000003 copy.json", "Thumbs.db", "3.json", "000003.json.bak"])
+def test_stray_files_beside_the_records_are_no_images(
+    tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel], name: str
+) -> None:
+    dataset = DatasetStore.open(tmp_path / "d", recipe, models, "")
+    dataset.commit(_image(0))
+    for folder in (".records", ".records/000001"):
+        (tmp_path / "d" / folder / name).write_text("{}")
+    dataset.finish()
+    assert dataset.done() == {0}
+    assert read_json(tmp_path / "d" / "dataset.json")["counts"] == {"images": 1, "instances": 1}
 
 
 def test_labels_follow_from_poses_and_symmetries(
@@ -231,3 +266,25 @@ def test_the_plan_is_a_bijection() -> None:
         assert len({(p.drop, p.view) for p in plans}) == 2500
         assert len({(p.scene_id, p.im_id) for p in plans}) == 2500
         assert all(p.view < views and p.im_id < 1000 and p.scene_id >= 1 for p in plans)
+
+
+def test_a_dataset_begun_before_a_setting_existed_is_continued(
+    tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel]
+) -> None:
+    DatasetStore.open(tmp_path / "d", recipe, models, "")
+    path = tmp_path / "d" / "dataset.json"
+    header = json.loads(path.read_text())
+    del header["recipe"]["labels"]["visibility_delta_mm"]
+    path.write_text(json.dumps(header))
+    assert DatasetStore.open(tmp_path / "d", recipe, models, "").recipe == recipe
+
+
+@pytest.mark.parametrize("damaged", [None, {}, {"images": "many"}, {"imagse": 3}])
+def test_a_damaged_recipe_is_told(
+    tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel], damaged: object
+) -> None:
+    DatasetStore.open(tmp_path / "d", recipe, models, "")
+    path = tmp_path / "d" / "dataset.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "recipe": damaged}))
+    with pytest.raises(DatasetError if damaged == {} else UserError, match=r"dataset\.json: "):
+        DatasetStore.open(tmp_path / "d", recipe, models, "")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -13,7 +12,7 @@ import pytest
 from synthetless.generation import devices
 from synthetless.generation.devices import CPU, Devices, best, take
 from synthetless.io.files import claim
-from synthetless.scenes.blender import KINDS, RenderDevice
+from synthetless.scenes.blender import RenderDevice
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -47,7 +46,7 @@ def test_what_is_wished_for_is_taken_or_refused() -> None:
 
 
 def test_the_processor_is_taken_without_asking_blender(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(devices.machine, "ask", lambda _: pytest.fail("asked"))
+    monkeypatch.setattr(devices, "ask", lambda _: pytest.fail("asked"))
     assert devices.choose("cpu") == CPU
 
 
@@ -64,17 +63,13 @@ def test_workers_of_one_machine_take_different_gpus(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.blender
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "cpu"])
-def test_a_device_that_is_not_there_is_refused(kind: str) -> None:
-    listed = _python("from scenes import probe; import json; print(json.dumps(probe.devices()['devices']))")
-    if kind in {item["type"].lower() for item in json.loads(listed.stdout.splitlines()[-1])}:
-        pytest.skip(f"this machine has a {kind} device")
-    with pytest.raises(ValueError, match=f"--device {kind}: Blender sees no such device here, only cpu"):
-        devices.choose(kind)
-    done = _python(f"from scenes.blender import *; start(1, RenderDevice({kind!r}))")
+def test_a_device_that_is_not_there_is_refused() -> None:
+    absent = "optix" if sys.platform == "darwin" else "metal"
+    with pytest.raises(ValueError, match=f"--device {absent}: Blender sees no such device here, only "):
+        devices.choose(absent)
+    done = _python(f"from synthetless.scenes.blender import *; start(1, RenderDevice({absent!r}))")
     assert done.returncode == 1
-    assert "BlenderError" in done.stderr
-    assert kind in done.stderr
+    assert f"this Blender cannot render with {absent}" in done.stderr
 
 
 @pytest.mark.blender
@@ -108,7 +103,7 @@ def test_a_process_that_has_blender_can_spawn_others(since: str, tmp_path: Path)
     script.write_text(
         "import sys\n"
         "from multiprocessing import get_context\n"
-        "from scenes import blender\n"
+        "from synthetless.scenes import blender\n"
         "def version(): return blender.start(1).app.version_string\n"
         "if __name__ == '__main__':\n"
         "    before = list(sys.path)\n"
@@ -119,7 +114,7 @@ def test_a_process_that_has_blender_can_spawn_others(since: str, tmp_path: Path)
     done = subprocess.run(
         [sys.executable, str(script)],
         cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": str(ROOT / "src")},
         capture_output=True,
         text=True,
         timeout=200,

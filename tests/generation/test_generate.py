@@ -23,6 +23,7 @@ from synthetless.dataset.layout import ScenePaths
 from synthetless.dataset.reader import read_recipe, read_specs
 from synthetless.generation.executors import FAULT_VARIABLE
 from synthetless.generation.generate import Execution, generate
+from synthetless.io.cache import CACHE_VARIABLE
 from synthetless.io.files import read_json
 from synthetless.io.models import load_models
 from synthetless.scenes.spec import Intrinsics
@@ -112,6 +113,24 @@ def test_parts_do_not_change_a_byte(dataset: Path, recipe: Path, tmp_path: Path)
     assert data_files(out, {SHARED_LOCK}) == data_files(dataset)
 
 
+def test_the_cache_does_not_change_a_byte(dataset: Path, recipe: Path, tmp_path: Path) -> None:
+    """Without it, with a new one, and with one that is damaged."""
+    small = ["--images", "2", "--workers", "1"]
+    cache = tmp_path / "cache"
+    _generate(recipe, tmp_path / "without", *small, "--no-cache", **{CACHE_VARIABLE: str(cache)})
+    assert not cache.exists()
+    _generate(recipe, tmp_path / "with", *small, **{CACHE_VARIABLE: str(cache)})
+    kept = list(cache.rglob("*.npz"))
+    assert kept
+    for path in kept:
+        path.write_bytes(path.read_bytes()[:-1])
+    _generate(recipe, tmp_path / "damaged", *small, **{CACHE_VARIABLE: str(cache)})
+    without = data_files(tmp_path / "without")
+    assert data_files(tmp_path / "with") == without
+    assert data_files(tmp_path / "damaged") == without
+    assert {name for name in without if "/rgb/" in name} < data_files(dataset).keys()
+
+
 def test_another_seed_changes_every_image(dataset: Path, recipe: Path, tmp_path: Path) -> None:
     _generate(recipe, tmp_path / "d", "--seed", "1", "--images", "2")
     for im_id in range(2):
@@ -152,13 +171,13 @@ def test_drops_that_kill_hang_or_never_settle_do_not_stop_the_others(
 ) -> None:
     out = tmp_path / "d"
     faults = {FAULT_VARIABLE: "abort:0,hang:1,unsettled:3"}
-    options = ["--images", "10", "--workers", "2", "--drop-limit", "60"]
+    options = ["--images", "10", "--workers", "2", "--drop-limit", "20"]
     summary = json.loads(_generate(recipe, out, *options, code=1, **faults))
     assert summary["images"] == 4
     told = dict(line.split(": ", 1) for line in summary["failures"])
     assert told.keys() == {"drop 0", "drop 1", "drop 3"}
     assert "worker died" in told["drop 0"]
-    assert "60 s" in told["drop 1"]
+    assert "20 s" in told["drop 1"]
     assert "did not come to rest" in told["drop 3"]
     assert f"synthetless redo {out} 3" in told["drop 3"]
     note = read_json(out / ".failures" / "00000003.json")

@@ -27,12 +27,10 @@ from trees import data_files
 from synthetless.config import Recipe, load_recipe
 from synthetless.dataset.layout import LOGS_FOLDER, by_drop
 from synthetless.dataset.store import DatasetStore, versions
-from synthetless.generation import cluster, executors
-from synthetless.generation.cluster import connection, crew
-from synthetless.generation.cluster.connection import needs_of, room_for
-from synthetless.generation.cluster.worker import check_versions
+from synthetless.generation import executors, ray_executor
 from synthetless.generation.devices import Devices
-from synthetless.generation.executors import FAULT_VARIABLE, Job, Outcome, Workplace
+from synthetless.generation.executors import FAULT_VARIABLE, DropResult, DropTask, WorkerConfig
+from synthetless.generation.ray_executor import check_versions, needs_of, room_for
 from synthetless.generation.sources import load_sources
 
 pytest.importorskip("ray", reason="Ray is not installed, extra 'ray'")
@@ -50,7 +48,7 @@ render: {samples: 1}
 outputs: [rgb, depth, masks]
 """
 SMALL_NODE: dict[str, Any] = {"num_cpus": 1, "object_store_memory": 10**8}
-Execute = Callable[[list[Job], Workplace], Iterator[Outcome]]
+Execute = Callable[[list[DropTask], WorkerConfig], Iterator[DropResult]]
 
 
 @pytest.fixture(scope="module")
@@ -82,14 +80,14 @@ def two_nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
             shutil.rmtree(folder)
 
 
-def _make(root: Path, recipe: Recipe, execute: Execute, drop_limit_s: float = 300.0) -> list[Outcome]:
+def _make(root: Path, recipe: Recipe, execute: Execute, drop_limit_s: float = 300.0) -> list[DropResult]:
     """What generate does, with this executor."""
     sources = load_sources(recipe)
     dataset = DatasetStore.open(root, recipe, sources.models, sources.scenery_digest)
-    jobs = [Job(drop, tuple(images)) for drop, images in by_drop(dataset.missing(), recipe.camera.views_per_drop)]
-    outcomes = list(execute(jobs, Workplace(recipe, root, threads=1, drop_limit_s=drop_limit_s)))
+    tasks = [DropTask(drop, tuple(images)) for drop, images in by_drop(dataset.missing(), recipe.camera.views_per_drop)]
+    results = list(execute(tasks, WorkerConfig(recipe, root, threads=1, drop_limit_s=drop_limit_s)))
     dataset.finish()
-    return sorted(outcomes, key=lambda outcome: outcome.job.drop)
+    return sorted(results, key=lambda result: result.task.drop)
 
 
 def _images(tree: dict[str, bytes]) -> dict[str, bytes]:
@@ -106,7 +104,7 @@ def reference(recipe: Recipe, tmp_path_factory: pytest.TempPathFactory) -> dict[
 
 def _at_work() -> list[psutil.Process]:
     """The processes of the cluster that are at a drop."""
-    return [p for p in psutil.process_iter(["cmdline"]) if "ray::Worker.make" in " ".join(p.info["cmdline"] or ())]
+    return [p for p in psutil.process_iter(["cmdline"]) if "ray::RayWorker.make" in " ".join(p.info["cmdline"] or ())]
 
 
 def _generate(out: Path, address: str) -> subprocess.CompletedProcess[str]:
@@ -153,8 +151,8 @@ def test_images_and_sources_travel_where_no_folder_is_shared(
     travelling = recipe.model_copy(update={"images": 3, "source": source})
 
     _make(tmp_path / "local", travelling, partial(executors.run, workers=1))
-    outcomes = _make(own / "d", travelling, partial(cluster.run, address=two_nodes.address))
-    assert [(outcome.made, outcome.failure) for outcome in outcomes] == [(1, "")] * 3
+    results = _make(own / "d", travelling, partial(ray_executor.run, address=two_nodes.address))
+    assert [(result.made, result.failure) for result in results] == [(1, "")] * 3
     assert data_files(tmp_path / "d") == data_files(tmp_path / "local")
     assert list((tmp_path / "d" / LOGS_FOLDER).iterdir()) == [], "no worker has been here"
 
@@ -171,15 +169,15 @@ def test_a_lost_node_and_a_killed_worker_do_not_change_a_byte(
     special = {**SMALL_NODE, "num_gpus": 1}
     nodes = [two_nodes.add_node(**special)]
     deaths = []
-    bury = crew._Crew._bury
+    died = ray_executor._RayPool._died
 
-    def note(self: Any, call: Any, death: Exception) -> Outcome | None:
+    def note(self: Any, call: Any, death: Exception) -> DropResult | None:
         deaths.append(" ".join(str(death).split()))
-        return bury(self, call, death)
+        return died(self, call, death)
 
-    def run(jobs: list[Job], place: Workplace) -> Iterator[Outcome]:
-        for count, outcome in enumerate(cluster.run(jobs, place, two_nodes.address)):
-            yield outcome
+    def run(tasks: list[DropTask], config: WorkerConfig) -> Iterator[DropResult]:
+        for count, result in enumerate(ray_executor.run(tasks, config, two_nodes.address)):
+            yield result
             if count == 0:
                 with _interrupted() as worker:
                     two_nodes.remove_node(nodes.pop(), allow_graceful=False)
@@ -189,11 +187,11 @@ def test_a_lost_node_and_a_killed_worker_do_not_change_a_byte(
                 with _interrupted() as worker:
                     worker.kill()
 
-    monkeypatch.setattr(crew._Crew, "_bury", note)
-    monkeypatch.setattr(crew, "needs_of", lambda place, nodes: {"num_cpus": 1, "num_gpus": 1})
-    outcomes = _make(tmp_path / "d", recipe, run)
+    monkeypatch.setattr(ray_executor._RayPool, "_died", note)
+    monkeypatch.setattr(ray_executor, "needs_of", lambda config, nodes: {"num_cpus": 1, "num_gpus": 1})
+    results = _make(tmp_path / "d", recipe, run)
     two_nodes.remove_node(nodes.pop())
-    assert [(outcome.made, outcome.failure) for outcome in outcomes] == [(1, "")] * recipe.images
+    assert [(result.made, result.failure) for result in results] == [(1, "")] * recipe.images
     assert data_files(tmp_path / "d") == reference
     of_node = ["node has died" in death for death in deaths]
     assert of_node[0], "and of workers that were sent there before it was known"
@@ -215,8 +213,8 @@ def test_drops_that_kill_hang_or_never_settle_do_not_stop_the_others(
     two_nodes: Any, recipe: Recipe, reference: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(FAULT_VARIABLE, "abort:1,hang:2,unsettled:4")
-    outcomes = _make(tmp_path / "d", recipe, partial(cluster.run, address=two_nodes.address), drop_limit_s=15)
-    failed = {outcome.job.drop: outcome for outcome in outcomes if outcome.failure}
+    results = _make(tmp_path / "d", recipe, partial(ray_executor.run, address=two_nodes.address), drop_limit_s=15)
+    failed = {result.task.drop: result for result in results if result.failure}
     assert failed.keys() == {1, 2, 4}
     assert re.fullmatch(r"its worker died \(node \S+, process \d+: SYSTEM_ERROR: .+\)", failed[1].failure)
     assert failed[1].killed
@@ -230,10 +228,10 @@ def test_drops_that_kill_hang_or_never_settle_do_not_stop_the_others(
 def test_a_run_that_is_left_stops_its_workers_and_can_be_gone_on_with(
     two_nodes: Any, recipe: Recipe, reference: dict[str, bytes], tmp_path: Path
 ) -> None:
-    def first(jobs: list[Job], place: Workplace) -> Iterator[Outcome]:
-        outcomes = cluster.run(jobs, place, two_nodes.address)
-        yield next(outcomes)
-        outcomes.close()  # type: ignore[attr-defined]
+    def first(tasks: list[DropTask], config: WorkerConfig) -> Iterator[DropResult]:
+        results = ray_executor.run(tasks, config, two_nodes.address)
+        yield next(results)
+        results.close()  # type: ignore[attr-defined]
 
     _make(tmp_path / "d", recipe, first)
     _wait_until(lambda: not _at_work())
@@ -249,26 +247,28 @@ def _wait_until(fulfilled: Callable[[], bool]) -> None:
 
 
 @pytest.fixture
-def nowhere(recipe: Recipe, tmp_path: Path) -> Workplace:
-    return Workplace(recipe, tmp_path, threads=1, drop_limit_s=60.0)
+def nowhere(recipe: Recipe, tmp_path: Path) -> WorkerConfig:
+    return WorkerConfig(recipe, tmp_path, threads=1, drop_limit_s=60.0)
 
 
-def test_an_address_where_nobody_answers_is_refused_soon(nowhere: Workplace, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection, "_CONNECT_LIMIT_S", 6.0)
+def test_an_address_where_nobody_answers_is_refused_soon(
+    nowhere: WorkerConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ray_executor, "_CONNECT_LIMIT_S", 6.0)
     with socket.socket() as deaf:
         deaf.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{deaf.getsockname()[1]}"
         with pytest.raises(ValueError, match=rf"^address {address}: leads to no Ray cluster .* within 6 s.*`ray start"):
-            list(cluster.run([], nowhere, address))
+            list(ray_executor.run([], nowhere, address))
 
 
-def test_without_ray_it_is_told_how_to_install_it(nowhere: Workplace, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_ray_it_is_told_how_to_install_it(nowhere: WorkerConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ValueError, match=r"pip install 'synthetless\[ray\]'"):
-        list(cluster.run([], nowhere))
+        list(ray_executor.run([], nowhere))
 
 
-def test_nodes_hold_as_many_workers_as_their_cores_or_gpus_allow(nowhere: Workplace) -> None:
+def test_nodes_hold_as_many_workers_as_their_cores_or_gpus_allow(nowhere: WorkerConfig) -> None:
     nodes = [{"Resources": {"CPU": 8.0, "GPU": 2.0}}, {"Resources": {"CPU": 5.0}}, {"Resources": {"memory": 1e9}}]
     assert room_for(needs_of(nowhere, nodes), nodes) == 13
     assert room_for(needs_of(replace(nowhere, threads=2), nodes), nodes) == 4 + 2
@@ -277,9 +277,9 @@ def test_nodes_hold_as_many_workers_as_their_cores_or_gpus_allow(nowhere: Workpl
     assert room_for(needs_of(replace(nowhere, devices=Devices("auto")), nodes[1:]), nodes[1:]) == 5
 
 
-def test_a_gpu_that_no_node_offers_is_refused(two_nodes: Any, nowhere: Workplace) -> None:
+def test_a_gpu_that_no_node_offers_is_refused(two_nodes: Any, nowhere: WorkerConfig) -> None:
     with pytest.raises(ValueError, match=r"^no node of the Ray cluster has room for .* needs 1 CPU and 1 GPU$"):
-        list(cluster.run([], replace(nowhere, devices=Devices("optix")), two_nodes.address))
+        list(ray_executor.run([], replace(nowhere, devices=Devices("optix")), two_nodes.address))
 
 
 def test_a_node_with_another_blender_is_refused() -> None:

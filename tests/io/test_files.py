@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
+import os
 import resource
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -10,8 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synthetless.io.files import (
+    LockedError,
     atomic_file,
     atomic_write,
+    claim,
+    in_turn,
+    locked,
     read_json,
     read_json_lines,
     write_json,
@@ -102,3 +110,82 @@ def test_missing_files_and_broken_lines_are_named(tmp_path: Path) -> None:
     path.write_text('{"a": 1}\n{"a": \n')
     with pytest.raises(ValueError, match=r"a\.jsonl, line 2: not valid JSON"):
         read_json_lines(path)
+
+
+def _of_another_user(folder: Path) -> None:
+    if os.getuid():
+        pytest.skip("only root can give a folder to another user")
+    folder.mkdir(mode=0o700)
+    os.chown(folder, 65534, 65534)
+
+
+def _open_to_others(mode: int) -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        folder.mkdir()
+        folder.chmod(mode)
+
+    return make
+
+
+def _link(folder: Path) -> None:
+    (folder.parent / "elsewhere").mkdir(mode=0o700)
+    folder.symlink_to("elsewhere")
+
+
+def _file(folder: Path) -> None:
+    folder.write_text("")
+
+
+def _linked_lock(folder: Path) -> None:
+    folder.mkdir(mode=0o700)
+    (folder / "optix-0.lock").symlink_to("/etc/passwd")
+
+
+REFUSED: dict[str, Callable[[Path], None]] = {
+    "of another user": _of_another_user,
+    "readable by the group": _open_to_others(0o750),
+    "writable by all": _open_to_others(0o777),
+    "like the system's own": _open_to_others(0o1777),
+    "passable": _open_to_others(0o711),
+    "link": _link,
+    "dangling link": lambda folder: folder.symlink_to("nowhere"),
+    "link to itself": lambda folder: folder.symlink_to(folder),
+    "file": _file,
+    "pipe": os.mkfifo,
+    "a lock that is a link": _linked_lock,
+}
+
+
+@pytest.mark.parametrize("make", REFUSED.values(), ids=REFUSED)
+def test_a_number_is_claimed_in_a_folder_of_ones_own_alone(
+    make: Callable[[Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    folder = tmp_path / f"synthetless-{os.getuid()}"
+    make(folder)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(ValueError, match=rf"^{folder}.*(set TMPDIR$|symbolic links\)$)"):
+        claim("optix")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("mode", [0o700, 0o2700], ids=["0700", "0700 and the group's own"])
+def test_a_number_is_claimed(mode: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    _open_to_others(mode)(tmp_path / f"synthetless-{os.getuid()}")
+    assert [claim("optix"), claim("optix"), claim("cuda")] == [0, 1, 0]
+
+
+@pytest.mark.parametrize("fault", [errno.ENOLCK, errno.ENOTSUP, errno.EINVAL], ids=lambda fault: errno.errorcode[fault])
+def test_a_file_system_without_locks_is_named(fault: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def flock(_: int, __: int) -> None:
+        raise OSError(fault, os.strerror(fault))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    for lock in (lambda: locked(tmp_path), lambda: locked(tmp_path, "1-of-2"), lambda: in_turn(tmp_path)):
+        with pytest.raises(ValueError, match="this file system cannot lock files") as caught, lock():
+            pytest.fail("there is no lock")
+        assert not isinstance(caught.value, LockedError), "nobody is at work there"
+    with pytest.raises(ValueError, match=r"optix-0\.lock: cannot be locked"):
+        claim("optix")

@@ -83,7 +83,7 @@ def test_no_process_outlives_the_one_that_started_it(end: signal.Signals, tmp_pa
     )
     parent = subprocess.Popen(
         [sys.executable, script],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": str(ROOT / "src")},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import manifold3d
@@ -15,11 +16,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from synthetless.io.cache import Cache, digest
+from synthetless.scenes.collider import VERSION
 from synthetless.scenes.contact import Posed, Surface, measure
-from synthetless.scenes.mesh import Mesh
 from synthetless.scenes.physics import Collider, NotSettled, PhysicsSettings, Settled, collider, settle
 from synthetless.scenes.rotations import matrix, random_rotation
-from synthetless.scenes.spec import Pose
+from synthetless.scenes.spec import Mesh, Pose
 
 bpy = pytest.importorskip("bpy", exc_type=ImportError)
 pytestmark = pytest.mark.blender
@@ -151,14 +153,14 @@ def test_the_same_release_settles_alike_whatever_came_before(shapes: list[Part])
     assert other != first
     assert settle(colliders, release(colliders, 1), SETTINGS) == first
     script = (
-        "import sys; sys.path.insert(0, 'tests')\n"
+        "import sys; sys.path.insert(0, 'tests/scenes')\n"
         "import test_physics as t, trimesh\n"
         "cube = t.part(trimesh.creation.box((0.06, 0.06, 0.06)))\n"
         "colliders = [item for _, item in t.shapes.__wrapped__(cube)]\n"
         "print('settled', t.settle(colliders, t.release(colliders, 1), t.SETTINGS))\n"
     )
     root = Path(__file__).resolve().parents[2]
-    environment = os.environ | {"PYTHONHASHSEED": "5", "PYTHONPATH": str(root)}
+    environment = os.environ | {"PYTHONHASHSEED": "5", "PYTHONPATH": str(root / "src")}
     done = subprocess.run(
         [sys.executable, "-c", script], check=False, capture_output=True, text=True, cwd=root, env=environment
     )
@@ -232,3 +234,24 @@ def test_gap_and_depth_of_known_placements(shapes: list[Part]) -> None:
     contacts = measure([Posed(core, np.eye(3), np.array([0, 0, 0.03])), around], 0.008)
     assert contacts.penetration_m[0, 1] == 0.0, "the bore of a tube is outside"
     assert contacts.gap_m[0, 1] == pytest.approx(0.035 * np.cos(np.pi / 48) - 0.02 * np.sqrt(2), abs=2e-4)
+
+
+def test_a_collider_from_the_cache_is_the_same_to_the_bit(shapes: list[Part], tmp_path: Path) -> None:
+    """Computed and kept, read, and computed without a cache: the same arrays, and the same poses at rest."""
+    kept = [Cache(None), Cache(tmp_path), Cache(tmp_path)]
+    versions = []
+    for cache in kept:
+        colliders = []
+        for mesh, _ in shapes:
+            key = digest(mesh.vertices_m, mesh.faces)
+            colliders.append(collider(mesh, partial(cache.arrays, "collider", key, VERSION)))
+        versions.append(colliders)
+    assert len(list(tmp_path.rglob("*.npz"))) == len(shapes)
+    for without, computed, read in zip(*versions, strict=True):
+        for other in (computed, read):
+            assert [piece.tobytes() for piece in other.pieces_m] == [piece.tobytes() for piece in without.pieces_m]
+            assert other.hull_m.tobytes() == without.hull_m.tobytes()
+            assert other.mass_centre_m.tobytes() == without.mass_centre_m.tobytes()
+            assert other.volume_m3 == without.volume_m3
+    rests = [settle(colliders, release(colliders, 3), SETTINGS) for colliders in versions]
+    assert rests[0] == rests[1] == rests[2]

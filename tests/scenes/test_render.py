@@ -17,12 +17,11 @@ from synthetless.annotation.raycast import Plane, RayCaster
 from synthetless.annotation.scene import scene_caster
 from synthetless.config import load_recipe
 from synthetless.io.models import ObjectModel, load_models
-from synthetless.scenes.mesh import Mesh
-from synthetless.scenes.render import Stage
+from synthetless.scenes.render import BlenderSession
 from synthetless.scenes.rotations import matrix
 from synthetless.scenes.sampling import Catalogue, sample_scene
 from synthetless.scenes.settings import RenderSettings
-from synthetless.scenes.spec import AmbientLight, Intrinsics, Material, ObjectSpec, Pose, SceneSpec, View
+from synthetless.scenes.spec import AmbientLight, Intrinsics, Material, Mesh, ObjectSpec, Pose, SceneSpec, View
 from synthetless.scenes.textures import ProceduralTexture
 
 pytestmark = pytest.mark.blender
@@ -73,10 +72,10 @@ def _annotate(
 
 
 def _assert_agreement(
-    stage: Stage, caster: RayCaster, camera: Intrinsics, spec: SceneSpec, poses: list[Pose], folder: Path
+    session: BlenderSession, caster: RayCaster, camera: Intrinsics, spec: SceneSpec, poses: list[Pose], folder: Path
 ) -> int:
     """Compare Cycles' own object index and depth with the ray-cast ones; return how many instances were compared."""
-    with stage.scene(spec, poses) as scene:
+    with session.scene(spec, poses) as scene:
         rendered = cycles_geometry(scene, 0, folder)
         annotation = _annotate(caster, camera, spec, poses, scene.extrinsics(0))
     compared = 0
@@ -106,7 +105,7 @@ def _eroded(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 @pytest.mark.parametrize("name", CAMERAS)
 def test_pixels_and_poses_agree_for_any_camera(name: str, tmp_path: Path) -> None:
     camera, meshes = CAMERAS[name], _meshes()
-    stage = Stage(
+    session = BlenderSession(
         {("model", key): Mesh(vertices / 1000, faces) for key, (vertices, faces) in meshes.items()},
         camera,
         RenderSettings(),
@@ -118,7 +117,7 @@ def test_pixels_and_poses_agree_for_any_camera(name: str, tmp_path: Path) -> Non
     for drop in range(2):
         overrides = ["objects.count=[7, 9]", "camera.distance_m=[0.5, 0.8]", "camera.roll_deg=[-180, 180]"]
         spec, poses = _scene(overrides, dict.fromkeys(meshes, 0.06), drop)
-        compared += _assert_agreement(stage, caster, camera, spec, poses, tmp_path)
+        compared += _assert_agreement(session, caster, camera, spec, poses, tmp_path)
     assert compared >= 5
 
 
@@ -133,7 +132,7 @@ def test_pixels_and_poses_agree_on_the_builtin_parts(builtin_models: Path, tmp_p
 
 
 def _agreement_of_models(models: dict[int, ObjectModel], camera: Intrinsics, folder: Path) -> None:
-    stage = Stage(
+    session = BlenderSession(
         {("model", key): Mesh(model.vertices_mm / 1000, model.faces) for key, model in models.items()},
         camera,
         RenderSettings(),
@@ -145,7 +144,7 @@ def _agreement_of_models(models: dict[int, ObjectModel], camera: Intrinsics, fol
     compared = 0
     for drop in range(3):
         spec, poses = _scene(["objects.count=[8, 9]", "camera.distance_m=[0.65, 0.94]"], diameters, drop)
-        compared += _assert_agreement(stage, caster, camera, spec, poses, folder)
+        compared += _assert_agreement(session, caster, camera, spec, poses, folder)
     assert compared >= 12
 
 
@@ -167,33 +166,35 @@ def _white_card(light_strength: float, ambient: float) -> tuple[SceneSpec, list[
 
 
 @pytest.fixture
-def card_stage(tmp_path: Path) -> Stage:
+def card_session(tmp_path: Path) -> BlenderSession:
     card = trimesh.creation.box((0.05, 0.05, 0.0001))
     mesh = Mesh(np.array(card.vertices, dtype=np.float64), np.array(card.faces, dtype=np.int32))
     settings = RenderSettings(samples=64, denoiser="none", bounces=0)
-    return Stage({("model", 1): mesh}, Intrinsics(32, 32, 700, 700, 15.5, 15.5), settings, 0.5, log=tmp_path / "log")
+    return BlenderSession(
+        {("model", 1): mesh}, Intrinsics(32, 32, 700, 700, 15.5, 15.5), settings, 0.5, log=tmp_path / "log"
+    )
 
 
 @pytest.mark.parametrize(("strength", "ambient"), [(0.8, 0.0), (0.0, 0.6), (0.5, 0.25)])
-def test_brightness_is_what_the_recipe_says(card_stage: Stage, strength: float, ambient: float) -> None:
+def test_brightness_is_what_the_recipe_says(card_session: BlenderSession, strength: float, ambient: float) -> None:
     spec, poses = _white_card(strength, ambient)
-    with card_stage.scene(spec, poses) as scene:
+    with card_session.scene(spec, poses) as scene:
         centre = scene.render(0)[12:20, 12:20].mean()
     assert centre == pytest.approx(strength + ambient, rel=0.02)
 
 
-def test_a_render_repeats_to_the_bit(card_stage: Stage) -> None:
+def test_a_render_repeats_to_the_bit(card_session: BlenderSession) -> None:
     spec, poses = _white_card(0.5, 0.2)
     other, other_poses = _white_card(1.5, 0.1)
     images = []
     for current, at in ((spec, poses), (other, other_poses), (spec, poses)):
-        with card_stage.scene(current, at) as scene:
+        with card_session.scene(current, at) as scene:
             images.append(scene.render(0))
     np.testing.assert_array_equal(images[0], images[2])
     assert not np.array_equal(images[0], images[1])
 
 
-def test_a_scene_shows_its_own_texture_whatever_was_rendered_before(card_stage: Stage) -> None:
+def test_a_scene_shows_its_own_texture_whatever_was_rendered_before(card_session: BlenderSession) -> None:
     spec, poses = _white_card(0.5, 0.2)
     poses = [Pose(poses[0].rotation_wxyz, (0.0, 0.0, -0.5))]  # below the table, out of sight
     tables = [
@@ -202,7 +203,7 @@ def test_a_scene_shows_its_own_texture_whatever_was_rendered_before(card_stage: 
     ]
 
     def shown(table: SceneSpec) -> NDArray[np.float32]:
-        with card_stage.scene(table, poses) as scene:
+        with card_session.scene(table, poses) as scene:
             return scene.render(0)
 
     checks, marble, checks_again = shown(tables[0]), shown(tables[1]), shown(tables[0])
@@ -210,20 +211,20 @@ def test_a_scene_shows_its_own_texture_whatever_was_rendered_before(card_stage: 
     np.testing.assert_array_equal(checks, checks_again)
 
 
-def test_nothing_is_left_of_a_scene(card_stage: Stage) -> None:
-    data = card_stage.bpy.data
+def test_nothing_is_left_of_a_scene(card_session: BlenderSession) -> None:
+    data = card_session.bpy.data
     spec, poses = _white_card(0.5, 0.2)
-    with card_stage.scene(spec, poses):
+    with card_session.scene(spec, poses):
         assert len(data.objects) == 4  # card, table, lamp, camera
     kinds = (data.objects, data.materials, data.lights, data.worlds, data.cameras, data.images)
     assert [len(kind) for kind in kinds] == [0] * len(kinds)
     assert len(data.meshes) == 1, "the model is kept for the next scene"
 
 
-def test_the_log_takes_what_blender_prints(card_stage: Stage, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_log_takes_what_blender_prints(card_session: BlenderSession, capfd: pytest.CaptureFixture[str]) -> None:
     spec, poses = _white_card(0.5, 0.2)
-    with card_stage.scene(spec, poses) as scene:
+    with card_session.scene(spec, poses) as scene:
         scene.render(0)
     printed = capfd.readouterr()
     assert printed.out == printed.err == ""
-    assert card_stage.log.stat().st_size > 0
+    assert card_session.log.stat().st_size > 0

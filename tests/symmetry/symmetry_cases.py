@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from synthetless.symmetry import SymmetryGroup
 from synthetless.symmetry.quaternions import Floats, from_axis_angle, multiply, normalise, to_matrix
@@ -62,6 +65,20 @@ def some_motions(group: SymmetryGroup, rng: np.random.Generator) -> Floats:
     return motions
 
 
+def random_generators(group: SymmetryGroup, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Numbers of one to three random elements that generate a finite group, in random order, without the identity."""
+    table = _multiplication_table(group.name)
+    while True:
+        chosen = rng.permutation(np.arange(1, len(table)))[: rng.integers(1, 4)]
+        closure, queue = {0}, [0]
+        for i in queue:
+            new = set(table[i, chosen].tolist()) - closure
+            closure |= new
+            queue += new
+        if len(closure) == len(table):
+            return chosen
+
+
 def moved(R: Floats, t: Floats, motion: Floats) -> tuple[Floats, Floats]:
     """The pose after the model was moved by one of its symmetries: looks the same."""
     return R @ motion[:3, :3], R @ motion[:3, 3] + t
@@ -72,6 +89,14 @@ def symmetric_vertices(group: SymmetryGroup, rng: np.random.Generator) -> Floats
     seeds_mm = rng.uniform(-50, 50, size=(4, 3))
     motions = group.motions()
     return (np.einsum("mij,nj->mni", motions[:, :3, :3], seeds_mm) + motions[:, None, :3, 3]).reshape(-1, 3)
+
+
+@cache
+def _multiplication_table(name: str) -> NDArray[np.int64]:
+    """(order, order): number of the product of two elements, the same in every frame."""
+    elements = SymmetryGroup.from_name(name).elements_wxyz
+    products = multiply(elements[:, None], elements[None])
+    return np.argmax(np.abs(products @ elements.T), axis=2)
 
 
 def _permutations() -> list[Floats]:

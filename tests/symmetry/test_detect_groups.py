@@ -70,7 +70,7 @@ def test_the_tolerance_decides_and_the_costs_are_told() -> None:
     assert found.next_larger.group.name == "O(2)"
     assert 100 * found.next_larger.residual.max_mm / found.diameter_mm == pytest.approx(2, abs=0.05)
     assert found.answer_at(0.021 * found.diameter_mm) == found.next_larger
-    maxima = [finding.residual.max_mm for finding in found.staircase]
+    maxima = [fit.residual.max_mm for fit in found.staircase]
     assert maxima == sorted(maxima)
 
 

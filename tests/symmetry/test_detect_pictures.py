@@ -12,17 +12,16 @@ from numpy.typing import NDArray
 
 from synthetless.symmetry import SymmetryGroup, SymmetryTable
 from synthetless.symmetry.detection.detect import measure
-from synthetless.symmetry.detection.gallery import draw_table
 from synthetless.symmetry.detection.meshes import Mesh
-from synthetless.symmetry.detection.pictures import picture
+from synthetless.symmetry.detection.pictures import draw_table, picture
 from synthetless.symmetry.table import SymmetryEntry
 
 VIEWS_PX, HEAD_PX = 1200, 34
 
 
 def drawn(mesh: Mesh, *groups: SymmetryGroup) -> NDArray[np.uint8]:
-    findings = [measure(mesh.vertices_mm, mesh.faces, mesh.diameter_mm, group) for group in groups]
-    return picture("object 1", mesh, findings, 0.01 * mesh.diameter_mm)
+    fits = [measure(mesh.vertices_mm, mesh.faces, mesh.diameter_mm, group) for group in groups]
+    return picture("object 1", mesh, fits, 0.01 * mesh.diameter_mm)
 
 
 def mesh_of(x: float, y: float, z: float) -> Mesh:

@@ -47,7 +47,7 @@ def test_no_pose_has_a_smaller_margin_than_the_atlas_promises(name: str) -> None
     assert canonical.separation_deg == pytest.approx(2 * LISTED_DEG[name], rel=0.005)
 
 
-@pytest.mark.parametrize("name", ["C2", "C3", "D2", "D5", "T", "O", "SO(2)", "O(2)"])
+@pytest.mark.parametrize("name", ["C2", "C3", "D2", "D3", "D4", "D5", "D9", "T", "O", "SO(2)", "O(2)"])
 def test_the_papers_scheme_has_margins_down_to_what_is_said(name: str) -> None:
     canonical = CanonicalMap(SymmetryGroup.from_name(name))
     found = smallest_found(canonical, np.random.default_rng(1))

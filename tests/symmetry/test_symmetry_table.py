@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from symmetry_cases import ALL, SCHEMES, in_random_frame, random_rotations, seeds
 
 from synthetless.symmetry import SymmetryEntry, SymmetryGroup, SymmetryTable
+from synthetless.symmetry.quaternions import from_matrix, multiply, to_matrix
 
 BY_HAND = """
 object 26: {group: C2, axis: [0, 0, 1], offset: [-7, 0, 0]}
@@ -50,7 +52,7 @@ def test_the_file_gives_the_table_back_exactly(seed: int, tmp_path_factory: pyte
     rng = np.random.default_rng(seed)
     references = [None if i % 2 else tuple(map(tuple, random_rotations(rng, 1)[0].tolist())) for i in range(len(ALL))]
     entries = {i + 1: SymmetryEntry(in_random_frame(name, rng), references[i]) for i, name in enumerate(ALL)}
-    table = SymmetryTable(entries, SCHEMES[seed % 2], bool(seed % 3))
+    table = SymmetryTable(entries, SCHEMES[seed % 2], bool(seed % 3), decimals=4 + seed % 12)
     path = tmp_path_factory.mktemp("table") / "symmetries.json"
     table.write(path)
     first = path.read_bytes()
@@ -79,13 +81,41 @@ def test_what_the_file_says() -> None:
     )
 
 
+def test_only_rounded_poses_are_worth_a_key(tmp_path: Path) -> None:
+    table = SymmetryTable({1: SymmetryEntry(SymmetryGroup.from_name("C3"))})
+    assert "decimals" not in table.to_dict()
+    replace(table, decimals=6).write(tmp_path / "symmetries.json")
+    assert json.loads((tmp_path / "symmetries.json").read_text())["decimals"] == 6
+    read = SymmetryTable.read(tmp_path / "symmetries.json")
+    assert (read.decimals, read.canonical_map(1).decimals) == (6, 6)
+
+
 def test_digests_tell_tables_apart() -> None:
     def table(name: str, scheme: str = "pitteri2019", allocentric: bool = False) -> SymmetryTable:
         return SymmetryTable({1: SymmetryEntry(SymmetryGroup.from_name(name))}, scheme, allocentric)
 
     tables = [table("C2"), table("C3"), table("C2", "atlas"), table("C2", allocentric=True)]
-    assert len({t.digest() for t in tables}) == 4
+    tables += [replace(table("C2"), decimals=6)]
+    assert len({t.digest() for t in tables}) == 5
     assert table("C2").digest() == tables[0].digest()
+
+
+@pytest.mark.parametrize("name", ["D2", "D3"])
+def test_a_table_of_an_earlier_version_is_read_and_has_another_digest(name: str, tmp_path: Path) -> None:
+    """Its D_n had the fourth anchor of `pitteri2019` in another class: the labels are stale, the groups are right."""
+    group = in_random_frame(name, np.random.default_rng(0))
+    table = SymmetryTable({5: SymmetryEntry(group)})
+    former = table.to_dict()
+    anchors = from_matrix(to_matrix(np.array(former["objects"]["5"]["anchors"])))
+    anchors[3] = multiply(anchors[2], anchors[1])
+    former["objects"]["5"] |= {"anchors": anchors.tolist(), "separation_deg": 0.0}
+    path = tmp_path / "symmetries.json"
+    path.write_text(json.dumps(former))
+    assert SymmetryTable.read(path) == table
+    former["objects"]["5"]["anchors"][3] = anchors[2].tolist()
+    path.write_text(json.dumps(former))
+    with pytest.raises(ValueError, match="anchors does not follow"):
+        SymmetryTable.read(path)
 
 
 def test_tless_models_info_is_a_table_too(tless_models: Path) -> None:
@@ -114,13 +144,14 @@ def test_tless_models_info_is_a_table_too(tless_models: Path) -> None:
         ("26: {symmetries_discrete: [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1]]}", "object 26: .*reflection"),
         ("26: {group: C2}\nobject 26: {group: C3}", "object 26 is listed twice"),
         ("26: {group: C2}\n26: {group: C3}", "'26' is listed twice"),
-        ('{"26": {"group": "C2"}, "26": {"group": "C3"}}', "'26' is listed twice"),
+        ('{"26": {"group": "C2"}, "26": {"group": "C3"}}', 'key "26" occurs twice'),
         ("26: {group: C2, group: C3}", "'group' is listed twice"),
         ("26: {}", "no group"),
         ("widget: {group: C2}", "'widget' names no object"),
         ("schema: atlas", "did you mean 'scheme'"),
         ("scheme: pitteri\nobjects: {}", "unknown scheme 'pitteri'"),
         ("allocentric: maybe\nobjects: {}", "allocentric is 'maybe'"),
+        ("decimals: 2\nobjects: {}", "decimals is 2, not a whole number from 4 to 15"),
         ("objects: [1]", "not a mapping"),
         ("[1, 2]", "is a mapping"),
         ("a: [", "neither JSON nor YAML"),

@@ -13,13 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from synthetless.symmetry.detection.distance import Surface
-from synthetless.symmetry.detection.field import DistanceField
-from synthetless.symmetry.detection.orbits import some_elements
+from synthetless.symmetry.detection.distance import DistanceField, Surface
 from synthetless.symmetry.detection.refine import placed, refined
-from synthetless.symmetry.frames import frame_of_axis
+from synthetless.symmetry.detection.residual import some_elements
 from synthetless.symmetry.groups import SymmetryGroup
-from synthetless.symmetry.point_groups import THREE_FOLD_AXIS, X, Y, Z
+from synthetless.symmetry.point_groups import THREE_FOLD_AXIS, X, Y, Z, frame_of_axis
 from synthetless.symmetry.quaternions import Floats, conjugate, from_axis_angle, multiply, to_matrix
 
 MAX_FOLD = 60
@@ -40,7 +38,7 @@ _SAME_AXIS = float(np.cos(np.radians(4)))
 _SAME_PEAK = float(np.cos(np.radians(12)))
 _NEAR = 0.015  # mean deviation in the field, as a share of the diameter, that fitting may still bring near zero
 _ROUND = 0.01  # mean deviation of a solid of revolution with details that the field cannot resolve, likewise
-_SLACK = 0.035  # how far the field's worst deviation may be off before the group is fitted, likewise
+_FIELD_TOLERANCE = 0.035  # how far the field's largest deviation may be off before the group is fitted, likewise
 
 Deviations = Callable[[Floats], Floats]
 """From turns (..., 3, 3) to how far they move some points of a mesh off it, (..., N) mm."""
@@ -88,7 +86,9 @@ class CandidateSearch:
         if misfit > self._near:
             return Candidate(group, misfit, is_likely=False)
         images = _images(to_matrix(some_elements(group, 2 * _ELEMENTS)), self._many_points, _offset(group))
-        return Candidate(group, misfit, float(self._field(images).max()) < self._tolerance + _SLACK * self._diameter)
+        return Candidate(
+            group, misfit, float(self._field(images).max()) < self._tolerance + _FIELD_TOLERANCE * self._diameter
+        )
 
     def _axes(self) -> list[SymmetryGroup]:
         """The likeliest axes as fitted groups C_p, p the prime that showed them."""

@@ -11,15 +11,13 @@ import numpy as np
 import trimesh
 
 from synthetless.errors import UserError
-from synthetless.io.files import atomic_write, read_json, write_json
+from synthetless.io.files import atomic_write, write_json
 from synthetless.io.parallel import each
 from synthetless.symmetry.atlas import SCHEMES, Scheme
-from synthetless.symmetry.detection.detect import Detected, Finding, detect
+from synthetless.symmetry.detection.detect import Detected, GroupFit, detect
 from synthetless.symmetry.detection.meshes import find_meshes, read_mesh, unit_warning
 from synthetless.symmetry.groups import SymmetryGroup
-from synthetless.symmetry.table import SymmetryEntry, SymmetryTable
-
-INFO_FILE = "models_info.json"
+from synthetless.symmetry.table import MODELS_INFO_FILE, SymmetryEntry, SymmetryTable
 
 
 @dataclass(frozen=True)
@@ -91,7 +89,7 @@ class DetectedFolder:
         for target, o in targets.items():
             if not target.exists():
                 atomic_write(target, self._ply(o))
-        write_json(to / INFO_FILE, {str(o.obj_id): _models_info(o) for o in self.objects})
+        write_json(to / MODELS_INFO_FILE, {str(o.obj_id): _models_info(o) for o in self.objects})
 
     def _ply(self, o: DetectedObject) -> bytes:
         if o.path.suffix.lower() == ".ply" and self.scale == 1:
@@ -153,13 +151,10 @@ def _detect_file(task: _Task) -> DetectedObject:
 
 
 def _declared(folder: Path) -> dict[int, SymmetryGroup]:
-    path = folder / INFO_FILE
+    path = folder / MODELS_INFO_FILE
     if not path.exists():
         return {}
-    try:
-        table = SymmetryTable.from_models_info(read_json(path))
-    except ValueError as error:
-        raise UserError(f"{path}: {error}" if str(path) not in str(error) else str(error)) from error
+    table = SymmetryTable.read(path)
     return {obj_id: entry.group for obj_id, entry in table.entries.items()}
 
 
@@ -177,22 +172,22 @@ def _object_json(o: DetectedObject) -> dict[str, Any]:
         "diameter_mm": found.diameter_mm,
         "tolerance_mm": found.tolerance_mm,
         "warning": o.warning,
-        "residuals": [_finding_json(f, found) for f in found.findings],
+        "residuals": [_fit_json(f, found) for f in found.fits],
     }
 
 
-def _finding_json(finding: Finding, found: Detected) -> dict[str, Any]:
-    residual = finding.residual
+def _fit_json(fit: GroupFit, found: Detected) -> dict[str, Any]:
+    residual = fit.residual
     return {
-        **_group_json(finding.group),
+        **_group_json(fit.group),
         "max_mm": residual.max_mm,
         "p95_mm": residual.p95_mm,
         "rms_mm": residual.rms_mm,
         "worst_mm": None if residual.worst_mm is None else list(residual.worst_mm),
         "max_percent": 100 * residual.max_mm / found.diameter_mm,
-        "is_answer": finding == found.answer,
-        "is_next_larger": finding == found.next_larger,
-        "is_declared": finding == found.declared,
+        "is_answer": fit == found.answer,
+        "is_next_larger": fit == found.next_larger,
+        "is_declared": fit == found.declared,
     }
 
 

@@ -1,4 +1,7 @@
-"""A picture of a part: coloured by how far a group's elements move its surface, with the group's axes."""
+"""Pictures of parts: coloured by how far a group's elements move the surface, with the group's axes.
+
+`obj_%06d.png` for each object of a folder or table.
+"""
 
 from __future__ import annotations
 
@@ -14,16 +17,20 @@ from scipy.spatial import cKDTree
 
 from synthetless.annotation.instances import PosedModel
 from synthetless.annotation.raycast import RayCaster
+from synthetless.errors import UserError
 from synthetless.io.files import atomic_write
 from synthetless.io.images import encode_png
+from synthetless.io.parallel import each
 from synthetless.scenes.spec import Intrinsics
-from synthetless.symmetry.detection.detect import Finding
+from synthetless.symmetry.detection.detect import GroupFit, measure
 from synthetless.symmetry.detection.distance import PIECE, Surface
-from synthetless.symmetry.detection.meshes import Mesh
-from synthetless.symmetry.detection.orbits import moved, spread_elements
+from synthetless.symmetry.detection.folder import DetectedFolder
+from synthetless.symmetry.detection.meshes import Mesh, find_meshes, read_mesh
 from synthetless.symmetry.detection.report import group_cells
+from synthetless.symmetry.detection.residual import moved, spread_elements
 from synthetless.symmetry.groups import SymmetryGroup
 from synthetless.symmetry.quaternions import Floats, normalise
+from synthetless.symmetry.table import SymmetryTable
 
 Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -38,16 +45,90 @@ _INK, _GREY = (40, 40, 40), (190, 190, 190)
 _AXIS_COLOURS = {2: (30, 90, 220), 3: (20, 150, 60), 4: (200, 40, 160), 5: (220, 120, 0)}
 _MAIN_AXIS = (210, 20, 20)
 _DASHES = 120
+_TOLERANCE_PERCENT = 1.0  # of the diameter: the scale of a table's picture does not end below it
 
 
-def picture(title: str, mesh: Mesh, findings: Sequence[Finding], tolerance_mm: float) -> Image:
-    """One row of views per finding: (H, W, 3) RGB.
+def draw_detected(detected: DetectedFolder, to: Path, workers: int | None = None) -> None:
+    """Draw every object with its group and, below, the next larger one.
+
+    Args:
+        detected: what `detect_folder` found.
+        to: folder of the pictures; made if it is missing.
+        workers: processes; one per available core if None.
+
+    Raises:
+        UserError: a mesh cannot be read any more, or a picture not be written.
+    """
+    tasks = [
+        _Task(
+            path=o.path,
+            scale=detected.scale,
+            target=to / f"obj_{o.obj_id:06d}.png",
+            title=f"object {o.obj_id}",
+            tolerance_percent=detected.tolerance_percent,
+            shown=tuple(f for f in (o.detected.answer, o.detected.next_larger) if f is not None),
+        )
+        for o in detected.objects
+    ]
+    _draw_all(tasks, workers)
+
+
+def draw_table(table: SymmetryTable, models: Path, to: Path, workers: int | None = None) -> None:
+    """Draw the objects of a symmetry table whose meshes a folder holds; arguments and errors as in `draw_detected`.
+
+    Raises:
+        UserError: the folder holds none of the table's objects.
+    """
+    paths = {obj_id: path for obj_id, path in find_meshes(models).paths.items() if obj_id in table.entries}
+    if not paths:
+        raise UserError(f"{models}: holds none of the table's objects, {', '.join(map(str, table.entries))}")
+    tasks = [
+        _Task(
+            path,
+            1.0,
+            to / f"obj_{obj_id:06d}.png",
+            f"object {obj_id}",
+            _TOLERANCE_PERCENT,
+            (table.entries[obj_id].group,),
+        )
+        for obj_id, path in paths.items()
+    ]
+    _draw_all(tasks, workers)
+
+
+@dataclass(frozen=True)
+class _Task:
+    path: Path
+    scale: float
+    target: Path
+    title: str
+    tolerance_percent: float
+    shown: tuple[GroupFit | SymmetryGroup, ...]
+
+
+def _draw_all(tasks: list[_Task], workers: int | None) -> None:
+    for _ in each(_draw, tasks, workers, "pictures", "mesh"):
+        pass
+
+
+def _draw(task: _Task) -> None:
+    mesh = read_mesh(task.path, task.scale)
+    tolerance_mm = task.tolerance_percent / 100 * mesh.diameter_mm
+    fits = [
+        shown if isinstance(shown, GroupFit) else measure(mesh.vertices_mm, mesh.faces, mesh.diameter_mm, shown)
+        for shown in task.shown
+    ]
+    write_picture(task.target, picture(task.title, mesh, fits, tolerance_mm))
+
+
+def picture(title: str, mesh: Mesh, fits: Sequence[GroupFit], tolerance_mm: float) -> Image:
+    """One row of views per fit: (H, W, 3) RGB.
 
     The colour of a surface point is its largest deviation over (at most 16, evenly chosen) elements of the group; a
     ring marks the point that deviates most, be it visible or not.
     """
     views = _Views(mesh)
-    rows = [views.row(finding, f"{title}   " if i == 0 else "", tolerance_mm) for i, finding in enumerate(findings)]
+    rows = [views.row(fit, f"{title}   " if i == 0 else "", tolerance_mm) for i, fit in enumerate(fits)]
     return np.concatenate(rows)
 
 
@@ -99,19 +180,17 @@ class _Views:
             for c in self._cameras
         ]
 
-    def row(self, finding: Finding, title: str, tolerance_mm: float) -> Image:
-        deviations = self._deviations(finding.group)
-        top = max(finding.residual.max_mm, tolerance_mm)
-        axes = _axes_of(finding.group)
-        tiles = [self._tile(i, deviations / top, finding, axes) for i in range(len(self._cameras))]
+    def row(self, fit: GroupFit, title: str, tolerance_mm: float) -> Image:
+        deviations = self._deviations(fit.group)
+        top = max(fit.residual.max_mm, tolerance_mm)
+        axes = _axes_of(fit.group)
+        tiles = [self._tile(i, deviations / top, fit, axes) for i in range(len(self._cameras))]
         body = np.concatenate([*tiles, _legend(top, tolerance_mm, axes)], axis=1)
         head = np.full((_HEAD_PX, body.shape[1], 3), 255, np.uint8)
-        name, axis, offset = group_cells(finding.group)
+        name, axis, offset = group_cells(fit.group)
         place = "" if name == "C1" else f"   axis {axis}   fixed point {offset}"
-        share = 100 * finding.residual.max_mm / self._diameter
-        _write(
-            head, f"{title}{name}{place}   largest residual {finding.residual.max_mm:.3f} mm ({share:.2f} %)", (10, 23)
-        )
+        share = 100 * fit.residual.max_mm / self._diameter
+        _write(head, f"{title}{name}{place}   largest residual {fit.residual.max_mm:.3f} mm ({share:.2f} %)", (10, 23))
         return np.concatenate([head, body])
 
     def _deviations(self, group: SymmetryGroup) -> Floats:
@@ -125,7 +204,7 @@ class _Views:
         ]
         return np.asarray(np.max(found, axis=0))
 
-    def _tile(self, i: int, shares: Floats, finding: Finding, axes: Sequence[_Axis]) -> Image:
+    def _tile(self, i: int, shares: Floats, fit: GroupFit, axes: Sequence[_Axis]) -> Image:
         camera, seen = self._cameras[i], self._seen[i]
         image = np.full((_TILE_PX, _TILE_PX, 3), 255, np.uint8)
         on_part = seen.instance_ids >= 0
@@ -136,9 +215,9 @@ class _Views:
         image[on_part] = np.clip(colours * shading[:, None], 0, 255)
         depth = np.where(on_part, seen.depth_mm, np.inf)
         for axis in reversed(axes):
-            self._draw_axis(image, camera, depth, np.array(finding.group.offset_mm), axis)
-        if finding.residual.worst_mm is not None:
-            _mark(image, camera, np.array(finding.residual.worst_mm))
+            self._draw_axis(image, camera, depth, np.array(fit.group.offset_mm), axis)
+        if fit.residual.worst_mm is not None:
+            _mark(image, camera, np.array(fit.residual.worst_mm))
         _draw_frame(image, camera.R)
         return image
 

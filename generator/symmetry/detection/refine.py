@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from synthetless.symmetry.detection.distance import Surface
-from synthetless.symmetry.detection.orbits import some_elements
-from synthetless.symmetry.detection.residual import Meter
+from synthetless.symmetry.detection.residual import ResidualMeter, some_elements
 from synthetless.symmetry.groups import SymmetryGroup
 from synthetless.symmetry.point_groups import parse_name
 from synthetless.symmetry.quaternions import Floats, from_axis_angle, multiply, normalise, to_matrix
@@ -84,14 +83,14 @@ def placed(name: str, frame_wxyz: Floats, offset_mm: Floats) -> SymmetryGroup:
     return SymmetryGroup.from_name(name, frame=matrix, offset_mm=offset_mm)
 
 
-def simplified(group: SymmetryGroup, meter: Meter) -> SymmetryGroup:
+def simplified(group: SymmetryGroup, meter: ResidualMeter) -> SymmetryGroup:
     """The group in the place that is easiest to read and fits as well: the frame nearest to the model's, axes along
     the coordinate axes, a fixed point of few digits."""
     if group.name == "C1":
         return group
     group = SymmetryGroup.from_bop(group.to_bop())
     snapped = _on_coordinate_axes(group, meter.diameter_mm)
-    worse = meter.glance(snapped) - meter.glance(group)
+    worse = meter.estimate(snapped) - meter.estimate(group)
     return snapped if worse <= _NO_WORSE * meter.diameter_mm else group
 
 

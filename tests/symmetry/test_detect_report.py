@@ -10,7 +10,7 @@ import pytest
 from symmetry_cases import random_rotations
 
 from synthetless.symmetry import CanonicalMap, SymmetryGroup, SymmetryTable
-from synthetless.symmetry.detection.show import DANGEROUS_DEG, dangerous_views, describe, direction_text, read_table
+from synthetless.symmetry.detection.report import DANGEROUS_DEG, dangerous_views, describe, direction_text
 from synthetless.symmetry.table import SymmetryEntry
 
 UPRIGHT_FROM_THE_SIDE = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
@@ -75,7 +75,7 @@ def test_directions_in_words() -> None:
 
 
 def test_a_table_in_lines(builtin_models: Path) -> None:
-    text = describe(read_table(builtin_models))
+    text = describe(SymmetryTable.read(builtin_models))
     rows = {line.split()[0]: line.split() for line in text.splitlines() if line.strip()}
     assert rows["27"] == ["27", "C4", "4", "z", "origin", "2", "0.00", "4", "15.86"]
     assert rows["26"][4:7] == ["(-7", "0", "0)"]
@@ -85,12 +85,12 @@ def test_a_table_in_lines(builtin_models: Path) -> None:
 
 def test_tables_are_found_where_they_are(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"holds neither symmetries\.json nor models_info\.json"):
-        read_table(tmp_path)
+        SymmetryTable.read(tmp_path)
     fields = SymmetryGroup.from_name("C2").to_bop()
     (tmp_path / "models_info.json").write_text(json.dumps({"5": {"diameter": 10.0, "name": "knob", **fields}}))
-    assert read_table(tmp_path).entries[5].group.name == "C2"
+    assert SymmetryTable.read(tmp_path).entries[5].group.name == "C2"
     SymmetryTable({1: SymmetryEntry(SymmetryGroup.from_name("O"))}).write(tmp_path / "symmetries.json")
-    assert list(read_table(tmp_path).entries) == [1]
+    assert list(SymmetryTable.read(tmp_path).entries) == [1]
     (tmp_path / "hand.yaml").write_text("object 3: {group: C3, axis: [0, 0, 0]}")
     with pytest.raises(ValueError, match=r"hand\.yaml: object 3: .*axis is zero"):
-        read_table(tmp_path / "hand.yaml")
+        SymmetryTable.read(tmp_path / "hand.yaml")

@@ -1,0 +1,106 @@
+"""How a dataset is begun, continued and retried: nothing is written before the lock is held."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from trees import contents
+
+from synthetless.config import Recipe, load_recipe
+from synthetless.dataset.layout import DATASET_FILE, Part
+from synthetless.generation import generate as generation
+from synthetless.generation.generate import Execution, generate, retry
+from synthetless.io.files import LockedError, in_turn, locked
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def recipe() -> Recipe:
+    return load_recipe(ROOT / "configs" / "demo.yaml", ["images=4"])
+
+
+@pytest.fixture
+def begun(recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A dataset without images; nothing is rendered in these tests."""
+    monkeypatch.setattr(generation, "_make", lambda *_: [])
+    monkeypatch.setattr(generation, "_draw_sheet", lambda _: None)
+    generate(recipe, tmp_path / "d", Execution(workers=1))
+    return tmp_path / "d"
+
+
+@pytest.mark.parametrize("part", [None, Part(1, 2)], ids=["whole", "part"])
+def test_nothing_is_begun_where_another_is_at_work(part: Part | None, recipe: Recipe, tmp_path: Path) -> None:
+    with locked(tmp_path):
+        before = contents(tmp_path)
+        with pytest.raises(LockedError, match="another synthetless is writing here"):
+            generate(recipe, tmp_path, Execution(workers=1, part=part))
+        assert contents(tmp_path) == before
+
+
+def test_nothing_is_continued_or_retried_where_another_is_at_work(begun: Path, recipe: Recipe) -> None:
+    (begun / "camera.json").unlink()
+    calls: list[Callable[[], object]] = [
+        lambda: generate(recipe, begun, Execution(workers=1)),
+        lambda: retry(begun, 0),
+    ]
+    with locked(begun):
+        before = contents(begun)
+        for call in calls:
+            with pytest.raises(LockedError):
+                call()
+        assert contents(begun) == before
+
+
+def test_parts_that_begin_at_once_are_of_one_recipe(
+    recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While one of them begins the dataset, the other waits, and then finds what it was begun with."""
+    monkeypatch.setattr(generation, "_make", lambda *_: [])
+    ended: list[object] = []
+
+    def make(seed: int) -> None:
+        mine = recipe.model_copy(update={"seed": seed})
+        try:
+            ended.append(generate(mine, tmp_path, Execution(workers=1, part=Part(seed, 2))))
+        except ValueError as error:
+            ended.append(error)
+
+    threads = [threading.Thread(target=make, args=(seed,)) for seed in (1, 2)]
+    with in_turn(tmp_path):
+        for thread in threads:
+            thread.start()
+        deadline = time.monotonic() + 60
+        while len(list(tmp_path.glob(".synthetless.*-of-2.lock"))) < 2 and time.monotonic() < deadline:
+            time.sleep(0.01)
+        time.sleep(0.5)
+        assert not (tmp_path / DATASET_FILE).exists()
+        assert not ended
+    for thread in threads:
+        thread.join(60)
+    refused = [str(result) for result in ended if isinstance(result, ValueError)]
+    assert len(ended) == 2
+    assert len(refused) == 1
+    assert "was begun with seed" in refused[0]
+
+
+def test_a_foreign_folder_is_left_as_it_is(recipe: Recipe, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    for part in (None, Part(1, 2)):
+        with pytest.raises(ValueError, match=r"holds notes\.txt, but no dataset\.json"):
+            generate(recipe, tmp_path, Execution(workers=1, part=part))
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_a_drop_that_is_not_there_is_not_retried(begun: Path, tmp_path: Path) -> None:
+    before = contents(begun)
+    with pytest.raises(ValueError, match="has no drop 7; its 4 images show the drops from 0 on"):
+        retry(begun, 7)
+    assert contents(begun) == before
+    with pytest.raises(ValueError, match=r"nothing/dataset\.json: not found"):
+        retry(tmp_path / "nothing", 0)
+    assert not (tmp_path / "nothing").exists()
