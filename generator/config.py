@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import Field, ValidationError
 
@@ -21,6 +21,7 @@ from synthetless.scenes.settings import Bounds, SceneSettings, Settings
 from synthetless.scenes.spec import Intrinsics
 
 BUILTIN = "builtin"
+Tree = TypeVar("Tree", bound=Settings)
 Output = Literal["rgb", "depth", "masks", "normals", "object_coordinates", "exr"]
 
 
@@ -103,7 +104,12 @@ class Setting:
 
 
 def load_recipe(path: Path | None, overrides: Sequence[str] = ()) -> Recipe:
-    """Read a recipe and apply ``key.path=value`` overrides (values are YAML).
+    """Read a recipe and apply ``key.path=value`` overrides (values are YAML); errors as in ``load_settings``."""
+    return load_settings(Recipe, path, overrides)
+
+
+def load_settings(kind: type[Tree], path: Path | None, overrides: Sequence[str] = ()) -> Tree:
+    """Read a tree of settings and apply ``key.path=value`` overrides (values are YAML).
 
     Raises:
         RecipeError: unreadable file, no mapping, unknown key, value of the wrong kind or outside its range.
@@ -113,9 +119,9 @@ def load_recipe(path: Path | None, overrides: Sequence[str] = ()) -> Recipe:
     for override in overrides:
         _apply(tree, override)
     try:
-        return Recipe.model_validate(tree)
+        return kind.model_validate(tree)
     except ValidationError as error:
-        raise RecipeError(f"{origin}: {_explain(error)}") from None
+        raise RecipeError(f"{origin}: {_explain(error, kind)}") from None
 
 
 def dump_recipe(recipe: Recipe) -> dict[str, Any]:
@@ -170,12 +176,12 @@ def _apply(tree: dict[str, Any], override: str) -> None:
     node[path[-1]] = value
 
 
-def _explain(error: ValidationError) -> str:
+def _explain(error: ValidationError, kind: type[Settings]) -> str:
     """The first fault in one line: key, value, what would be right."""
     fault = error.errors(include_url=False)[0]
     key = ".".join(str(part) for part in fault["loc"])
     if fault["type"] == "extra_forbidden":
-        known = [setting.key for setting in settings()]
+        known = [setting.key for setting in settings(kind)]
         groups = sorted({".".join(k.split(".")[:-1]) for k in known} - {""})
         return f"unknown setting {shown(key)[1:-1]}{_nearest(key, known + groups)}"
     value = fault["input"]

@@ -59,7 +59,8 @@ class Losses(Protocol):
 
 
 Record = dict[str, Any]
-"""A line of the log: step, seconds, rate, every loss as the mean since the last line, and what was measured."""
+"""A line of the log: step, seconds since the start and left, rate, every loss as the mean since the last line, and what
+was measured."""
 
 
 def fit(
@@ -70,6 +71,7 @@ def fit(
     measure: Callable[[], Mapping[str, float]] | None = None,
     precision: torch.dtype | None = None,
     device: torch.device | None = None,
+    writes: bool = True,
 ) -> Iterator[Record]:
     """Train, and yield a record at every interval and at the end.
 
@@ -81,6 +83,7 @@ def fit(
         measure: what else to put into a record, on validation data say; the model is in evaluation mode meanwhile.
         precision: of the forward pass where it differs from float32.
         device: where the model is, for ``precision``.
+        writes: whether this process writes into ``run``; of several, one does, and all continue its checkpoint.
 
     Raises:
         UserError: a checkpoint is damaged or of another model, or a loss is not finite.
@@ -88,10 +91,12 @@ def fit(
     parameters = [p for p in model.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(parameters, lr=schedule.peak_rate, weight_decay=schedule.weight_decay)
     step = _resume(run, model, optimizer) if run is not None else 0
-    if run is not None:
-        _forget_after(run / LOG_FILE, step)
+    kept = run if writes else None
+    if kept is not None:
+        _forget_after(kept / LOG_FILE, step)
     sums: dict[str, float] = {}
-    since, started = step, time.monotonic()
+    first = since = step
+    started = time.monotonic()
     while step < schedule.steps:
         model.train()
         for group in optimizer.param_groups:
@@ -109,19 +114,17 @@ def fit(
         for name, part in parts.items():
             sums[name] = sums.get(name, 0.0) + part.item()
         if step % schedule.log_every == 0 or step == schedule.steps:
-            record: Record = {
-                "step": step,
-                "seconds": round(time.monotonic() - started, 2),
-                "rate": schedule.rate(step - 1),
-            }
+            seconds = time.monotonic() - started
+            record: Record = {"step": step, "seconds": round(seconds, 2), "rate": schedule.rate(step - 1)}
+            record["seconds_left"] = round(seconds / (step - first) * (schedule.steps - step), 1)
             record |= {name: value / (step - since) for name, value in sums.items()}
             if measure is not None:
                 model.eval()
                 with torch.no_grad():
                     record |= measure()
             sums, since = {}, step
-            if run is not None:
-                _append(run / LOG_FILE, record)
+            if kept is not None:
+                _append(kept / LOG_FILE, record)
             yield record
         if run is not None and (step % schedule.save_every == 0 or step == schedule.steps):
             save(

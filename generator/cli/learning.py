@@ -1,16 +1,18 @@
-"""Commands of the learning system: score, compare."""
+"""Commands of the learning system: train, predict, score, compare."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from synthetless.cli.options import Split, Workers
-from synthetless.config import BUILTIN
+from synthetless.config import BUILTIN, load_settings
 from synthetless.errors import UserError
+
+_NO_LOSSES = ("step", "seconds", "seconds_left", "rate")
 
 
 def score_command(
@@ -114,3 +116,61 @@ def _numbers(option: str, text: str) -> list[int]:
         return [int(word) for word in _words(text)]
     except ValueError:
         raise UserError(f"{option} is {text!r}; object ids such as 18,27 are needed") from None
+
+
+def train_command(
+    config: Annotated[Path, typer.Argument(help="The training, a YAML file.")],
+    data: Annotated[list[Path], typer.Option(metavar="DIR", help="Folder of a dataset; may be given several times.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the run. Give it again to continue it.")],
+    labels: Annotated[
+        str | None, typer.Option(metavar="SET", help="true, map, pitteri2019, pitteri2019-top or atlas.")
+    ] = None,
+    device: Annotated[str, typer.Option(metavar="NAME", help="auto, cpu, cuda, cuda:1, ...")] = "auto",
+    models: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of the models, if they are not in the dataset.")
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change a setting; may be given several times."),
+    ] = None,
+) -> None:
+    """Train the detector and its pose head.
+
+    Several GPUs: torchrun --nproc-per-node N -m synthetless train CONFIG ...
+    """
+    need_torch()
+    from synthetless.learning.settings import Training
+    from synthetless.learning.train import PAGE_FILE, train
+
+    given = [*(overrides or []), *([f'labels="{labels}"'] if labels is not None else [])]
+    training = load_settings(Training, config, given)
+    steps = training.schedule.steps
+
+    def tell(record: dict[str, Any]) -> None:
+        shown = ", ".join(f"{name} {value:.3f}" for name, value in record.items() if name not in _NO_LOSSES)
+        left = record["seconds_left"]
+        print(f"step {record['step']} of {steps}: {shown}; {left / 60:.0f} min left", flush=True)
+
+    train(training, data, out, device, models, tell)
+    print(f"run: {out}\ncurves: {out / PAGE_FILE}")
+
+
+def predict_command(
+    run: Annotated[Path, typer.Argument(help="Folder of a training.")],
+    dataset: Annotated[Path, typer.Argument(help="Folder of a BOP dataset: its pictures and cameras are used.")],
+    to: Annotated[Path, typer.Option(metavar="FILE", help="BOP result file to write.")],
+    overlays: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for pictures with true and predicted boxes.")
+    ] = None,
+    split: Split = None,
+    device: Annotated[str, typer.Option(metavar="NAME", help="auto, cpu, cuda, ...")] = "auto",
+) -> None:
+    """Predict poses with a trained detector.
+
+    The classifier chooses the regressor, its corners are solved for the pose. Judge the file with score.
+    """
+    need_torch()
+    from synthetless.learning.predict import predict
+
+    count = predict(run, dataset, to, overlays, split, device)
+    print(f"{count} poses in {to}")
