@@ -224,14 +224,21 @@ def recipe_page() -> str:
         "between the two unless the setting says otherwise. `dataset.json` records the recipe as it was used.",
         "",
         "This page is written by `make docs`.",
+        *settings_tables(Recipe),
     ]
+    return "\n".join(lines) + "\n"
+
+
+def settings_tables(kind: type[Settings]) -> list[str]:
+    """Lines of Markdown: a table of each group's settings."""
+    lines: list[str] = []
     group = None
-    for setting in settings():
+    for setting in settings(kind):
         name = setting.key.rpartition(".")[0]
         if name != group:
             group = name
             title = f"`{group}`" if group else "At the top"
             lines += ["", f"## {title}", "", "| setting | value | default | meaning |", "|---|---|---|---|"]
-        kind = setting.kind.replace("|", "\\|")
-        lines.append(f"| `{setting.key}` | {kind} | `{json.dumps(setting.default)}` | {setting.description} |")
-    return "\n".join(lines) + "\n"
+        kind_of_value = setting.kind.replace("|", "\\|")
+        lines.append(f"| `{setting.key}` | {kind_of_value} | `{json.dumps(setting.default)}` | {setting.description} |")
+    return lines

@@ -16,9 +16,12 @@ import sys
 import tempfile
 import textwrap
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
+
+import psutil
 
 from synthetless.generation.devices import Answer, ask, probe
 from synthetless.io.files import nearest_existing
@@ -49,7 +52,6 @@ LOADED_LATER = ("libXxf86vm.so.1", "libEGL.so.1")
 """Not linked by Blender 4.5, but by other versions, or looked for when they are needed."""
 
 CGROUP = Path("/sys/fs/cgroup")
-MEMINFO = Path("/proc/meminfo")
 _UNLIMITED_BYTES = 2**60  # version 1 of cgroups writes a number near 2**63 where there is no limit
 
 ENOUGH_DISK_GB, LEAST_DISK_GB = 10.0, 0.5
@@ -194,7 +196,7 @@ def check_cores(usable: int, quota: float | None) -> Check:
 
 def check_memory(available_bytes: int | None) -> Check:
     if available_bytes is None:
-        return Check("memory", "warn", "unknown: no /proc/meminfo here")
+        return Check("memory", "warn", "unknown: the system does not tell")
     gigabytes = available_bytes / 1e9
     value = f"{gigabytes:.1f} GB available"
     remedy = f"{ENOUGH_MEMORY_GB:g} GB are enough; end other programs, or give the container more"
@@ -282,16 +284,12 @@ def core_quota(cgroup: Path = CGROUP) -> float | None:
     return quota / period if quota and quota > 0 and period else None
 
 
-def available_memory_bytes(meminfo: Path = MEMINFO, cgroup: Path = CGROUP) -> int | None:
+def available_memory_bytes(cgroup: Path = CGROUP) -> int | None:
     """Memory that a new process can have: what is available, at most a container's limit; None if nothing tells."""
-    try:
-        match = re.search(r"^MemAvailable:\s+(\d+) kB", meminfo.read_text(), re.MULTILINE)
-    except OSError:
-        match = None
     limits = [_numbers(cgroup / name, 1)[0] for name in ("memory.max", "memory/memory.limit_in_bytes")]
     known = [int(limit) for limit in limits if limit is not None and limit < _UNLIMITED_BYTES]
-    if match:
-        known.append(1024 * int(match[1]))
+    with suppress(OSError):  # no /proc here
+        known.append(psutil.virtual_memory().available)
     return min(known, default=None)
 
 

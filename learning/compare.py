@@ -180,7 +180,7 @@ def train_crops(
     validation: Crops,
     labels: LabelSet,
     seed: int,
-    width: int = 24,
+    width: int = 16,
 ) -> Trained:
     """One run: train on crops under a label set, and measure on others; ``width`` is the network's."""
     torch.manual_seed(seed)

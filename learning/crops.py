@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 
 class CropNet(nn.Module):
-    """Six convolutions and a hidden layer before the pose head; 10 million multiply-adds at 48 pixels.
+    """Six convolutions and a hidden layer before the pose head; 5 million multiply-adds at 48 pixels.
 
     Args:
         size_px: side of the crops, a multiple of 16.
@@ -27,7 +27,7 @@ class CropNet(nn.Module):
         width: channels of the first layer.
     """
 
-    def __init__(self, size_px: int, classes: int, regressors: int, width: int = 24) -> None:
+    def __init__(self, size_px: int, classes: int, regressors: int, width: int = 16) -> None:
         super().__init__()
         channels = [3, width, 2 * width, 2 * width, 4 * width, 4 * width, 8 * width]
         layers: list[nn.Module] = []
@@ -111,9 +111,11 @@ class CropBatcher:
         n, size = len(crops), crops.pixels.shape[1]
         angles = np.radians(rng.uniform(-roll_deg, roll_deg, n))
         pixels = np.stack([_turn(image, angle) for image, angle in zip(crops.pixels, angles, strict=True)])
-        gain, offset = rng.uniform(0.7, 1.3, (n, 1, 1, 1)), rng.uniform(-20, 20, (n, 1, 1, 1))
-        noise = rng.standard_normal((n, size, size, 1), dtype=np.float32) * rng.uniform(0, 10, (n, 1, 1, 1))
-        pixels = np.clip(pixels * gain + offset + noise, 0, 255).astype(np.uint8)
+        gain, offset, sigma = (
+            rng.uniform(low, high, (n, 1, 1, 1)).astype(np.float32) for low, high in ((0.7, 1.3), (-20, 20), (0, 10))
+        )
+        noise = rng.standard_normal((n, size, size, 1), dtype=np.float32)
+        pixels = np.clip(pixels * gain + (offset + sigma * noise), 0, 255).astype(np.uint8)
         R, t = turned(rolled(angles), crops.R_m2c, crops.t_m2c)
         return self.batch(Crops(pixels, crops.obj_ids, R, t, crops.K, crops.elevation_deg))
 

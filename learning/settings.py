@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
+from synthetless.config import settings_tables
 from synthetless.learning.targets import LabelSet
 from synthetless.scenes.settings import Bounds, Settings
 
@@ -100,3 +101,17 @@ class Training(Settings):
     """Images and instances."""
     schedule: ScheduleSettings = Field(default_factory=ScheduleSettings)
     """Steps."""
+
+
+def training_page() -> str:
+    """The reference page of all settings, as Markdown."""
+    head = [
+        "# Settings of a training",
+        "",
+        "A training is a YAML file of the settings below; a setting that it leaves out has its default. On the command",
+        "line, `--set schedule.steps=1000` overrides one. `run.json` records the training as it was used.",
+        "[learning.md](learning.md) says what it is about.",
+        "",
+        "This page is written by `make docs`.",
+    ]
+    return "\n".join([*head, *settings_tables(Training)]) + "\n"

@@ -32,13 +32,13 @@ from synthetless.scenes.spec import (
     Pose,
     Role,
     SceneSpec,
-    Vector,
     View,
 )
+from synthetless.scenes.srgb import linear_from_srgb
 from synthetless.scenes.textures import sample_texture
 
 _CANDLE = (1.0, 0.56, 0.17)
-"""Linear RGB of a black body at about 2000 K, largest component 1."""
+"""Linear RGB of a black body at about 2000 K, largest component 1: a lamp of warmth 1."""
 
 
 class Stream(IntEnum):
@@ -116,15 +116,10 @@ def _choose_objects(settings: ObjectSettings, catalogue: Catalogue, rng: np.rand
     return [chosen[i] for i in rng.permutation(len(chosen))]
 
 
-def _linear(srgb: float) -> float:
-    """Linear value of a displayed one (IEC 61966-2-1)."""
-    return srgb / 12.92 if srgb <= 0.04045 else ((srgb + 0.055) / 1.055) ** 2.4
-
-
 def _material(settings: ObjectSettings, rng: np.random.Generator) -> Material:
     grey = _uniform(rng, settings.grey)
     deviations = rng.uniform(-settings.tint, settings.tint, size=3)
-    red, green, blue = (_linear(min(max(grey + d, 0.0), 1.0)) for d in deviations.tolist())
+    red, green, blue = (linear_from_srgb(min(max(grey + d, 0.0), 1.0)) for d in deviations.tolist())
     return Material((red, green, blue), _uniform(rng, settings.roughness), _uniform(rng, settings.specular))
 
 
@@ -152,16 +147,20 @@ def _plane(settings: TableSettings, photos: Sequence[str], rng: np.random.Genera
     )
 
 
+def lamp_warmth(light: PointLight) -> float:
+    """The warmth that a lamp's colour was drawn with: 0 is white, 1 a candle."""
+    return (1 - light.color[1]) / (1 - _CANDLE[1])
+
+
 def _lights(settings: LightSettings, rng: np.random.Generator) -> tuple[PointLight, AmbientLight]:
     warmth = _uniform(rng, settings.warmth)
-    color: Vector = (1.0, 1 + warmth * (_CANDLE[1] - 1), 1 + warmth * (_CANDLE[2] - 1))
     light = PointLight(
         azimuth_deg=_uniform(rng, settings.azimuth_deg),
         elevation_deg=_uniform(rng, settings.elevation_deg),
         distance_m=_uniform(rng, settings.distance_m),
         strength=_uniform(rng, settings.strength),
         radius_m=_uniform(rng, settings.radius_m),
-        color=color,
+        color=(1.0, 1 + warmth * (_CANDLE[1] - 1), 1 + warmth * (_CANDLE[2] - 1)),
     )
     return light, AmbientLight(_uniform(rng, settings.ambient), (1.0, 1.0, 1.0))
 

@@ -12,7 +12,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 
-from synthetless.fetch.download import Persistence
+from synthetless.fetch import Persistence
 
 QUICK = Persistence(attempts=3, first_wait_s=0.0, timeout_s=5.0)
 CONTENT = np.random.default_rng(5).bytes(300_000)

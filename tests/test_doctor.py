@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
@@ -202,20 +203,32 @@ def test_quota_of_a_container(files: dict[str, str], quota: float | None, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("files", "available"),
+    ("system", "files", "available"),
     [
-        ({"meminfo": "MemTotal: 9000 kB\nMemAvailable:    8000 kB\n"}, 8000 * 1024),
-        ({"meminfo": "MemAvailable: 8000 kB\n", "memory.max": "max\n"}, 8000 * 1024),
-        ({"meminfo": "MemAvailable: 8000 kB\n", "memory.max": "1000000\n"}, 1_000_000),
-        ({"meminfo": "MemAvailable: 8000 kB\n", "memory/memory.limit_in_bytes": f"{2**63 - 4096}\n"}, 8000 * 1024),
-        ({"meminfo": "MemAvailable: 8000 kB\n", "memory/memory.limit_in_bytes": "5000000\n"}, 5_000_000),
-        ({"memory.max": "1000000\n"}, 1_000_000),
-        ({}, None),
+        (8_000_000, {}, 8_000_000),
+        (8_000_000, {"memory.max": "max\n"}, 8_000_000),
+        (8_000_000, {"memory.max": "1000000\n"}, 1_000_000),
+        (8_000_000, {"memory/memory.limit_in_bytes": f"{2**63 - 4096}\n"}, 8_000_000),
+        (8_000_000, {"memory/memory.limit_in_bytes": "5000000\n"}, 5_000_000),
+        (None, {"memory.max": "1000000\n"}, 1_000_000),
+        (None, {}, None),
     ],
 )
-def test_memory_of_a_container(files: dict[str, str], available: int | None, tmp_path: Path) -> None:
+def test_memory_of_a_container(
+    system: int | None,
+    files: dict[str, str],
+    available: int | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def virtual_memory() -> SimpleNamespace:
+        if system is None:
+            raise FileNotFoundError(2, "No such file or directory", "/proc/meminfo")
+        return SimpleNamespace(available=system)
+
+    monkeypatch.setattr("psutil.virtual_memory", virtual_memory)
     _write(tmp_path, files)
-    assert doctor.available_memory_bytes(tmp_path / "meminfo", tmp_path) == available
+    assert doctor.available_memory_bytes(tmp_path) == available
 
 
 def _write(folder: Path, files: dict[str, str]) -> None:

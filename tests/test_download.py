@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import fcntl
+import io
 import json
+import urllib.request
 from collections.abc import Iterator
+from http.client import HTTPMessage
 from pathlib import Path
 
 import pytest
@@ -26,7 +29,7 @@ from fetch_server import (
     trickle,
 )
 
-from synthetless.fetch.download import DownloadError, Persistence, download
+from synthetless.fetch import DownloadError, Persistence, _CarefulRedirects, download
 
 MB = 1_000_000
 
@@ -50,7 +53,7 @@ def test_a_file_is_downloaded(server: Server, tmp_path: Path) -> None:
     assert server.ranges == [None]
 
 
-def test_a_broken_download_is_gone_on_with(server: Server, tmp_path: Path) -> None:
+def test_a_broken_download_is_continued(server: Server, tmp_path: Path) -> None:
     server.script = [break_off(70_000), break_off(50_001), break_off(0), break_off(100_000)]
     assert get(server, tmp_path) == CONTENT
     assert server.ranges == [None, "bytes=70000-", "bytes=120001-", "bytes=120001-", "bytes=220001-"]
@@ -58,7 +61,7 @@ def test_a_broken_download_is_gone_on_with(server: Server, tmp_path: Path) -> No
 
 def test_a_later_call_goes_on(server: Server, tmp_path: Path) -> None:
     server.script = [break_off(123_456), fail(503), fail(503), fail(500)]
-    with pytest.raises(DownloadError, match=r"HTTP 500 .*; run it again to go on from 0\.1 MB"):
+    with pytest.raises(DownloadError, match=r"HTTP 500 .*; run it again to continue from 0\.1 MB"):
         get(server, tmp_path)
     assert get(server, tmp_path) == CONTENT
     assert server.ranges[-1] == "bytes=123456-"
@@ -150,6 +153,33 @@ def test_a_redirect_to_a_local_file_is_refused(server: Server, tmp_path: Path) -
     server.script = [redirect("file:///etc/hostname")]
     with pytest.raises(DownloadError, match="HTTP 302"):
         get(server, tmp_path)
+
+
+@pytest.mark.parametrize("to", ["ftp://127.0.0.1/archive.zip", "data:,hello", "gopher://127.0.0.1/", "//\x1b[2J/a"])
+def test_a_redirect_to_another_scheme_is_refused(to: str, server: Server, tmp_path: Path) -> None:
+    server.script = [redirect(to)] * QUICK.attempts
+    with pytest.raises(DownloadError) as raised:
+        get(server, tmp_path)
+    assert "\n" not in str(raised.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_redirect_that_gives_up_encryption_is_refused() -> None:
+    handler, secure = _CarefulRedirects(), urllib.request.Request("https://example.org/a.zip")
+    with pytest.raises(DownloadError, match=r"refused: it redirects to http://example\.org/b\.zip"):
+        handler.redirect_request(secure, io.BytesIO(), 302, "Found", HTTPMessage(), "http://example.org/b.zip")
+    for address in ("https://example.org/a.zip", "http://example.org/a.zip"):
+        followed = handler.redirect_request(
+            urllib.request.Request(address), io.BytesIO(), 302, "Found", HTTPMessage(), "https://example.org/b.zip"
+        )
+        assert followed is not None
+        assert followed.full_url == "https://example.org/b.zip"
+
+
+@pytest.mark.parametrize("length", ["²", "1" * 5000, "-5", "many", "1e3"])
+def test_a_length_that_is_no_number_is_passed_over(length: str, server: Server, tmp_path: Path) -> None:
+    server.script = [lambda handler: handler.reply(200, CONTENT, {"Content-Length": length})]
+    assert get(server, tmp_path) == CONTENT
 
 
 def test_a_slow_server_is_waited_for(server: Server, tmp_path: Path) -> None:

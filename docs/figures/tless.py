@@ -31,7 +31,7 @@ from synthetless.dataset.sheet import class_color
 from synthetless.io import images
 from synthetless.io.files import atomic_write, read_bytes
 from synthetless.io.models import read_models_info
-from synthetless.preview.overlays import Segment, axis_lines, box_lines
+from synthetless.preview.image import Segment, axis_lines, box_lines
 
 IMAGES = Path(__file__).resolve().parents[1] / "images"
 PLOT = "near_jump"

@@ -10,9 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from synthetless.cli.options import Split
-from synthetless.exports.coco import export_coco
-from synthetless.exports.webdataset import export_webdataset, relabel_webdataset
-from synthetless.fetch import fetch
+from synthetless.cli.terminal import say
 
 
 def fetch_command(
@@ -25,11 +23,13 @@ def fetch_command(
 
     They come from where they are published, are checked, and bring their licence.
     """
+    from synthetless.fetch import fetch
+
     report = fetch(what, to, source)
     if as_json:
-        print(json.dumps(asdict(report), default=str))
+        say(json.dumps(asdict(report), default=str))
     else:
-        print(f"{report}\n\n{report.licence}\nlicence: {report.licence_file}")
+        say(f"{report}\n\n{report.licence}\nlicence: {report.licence_file}")
 
 
 def coco_command(
@@ -44,7 +44,9 @@ def coco_command(
 
     Canonical poses, and box corners as keypoints, are in it.
     """
-    print(f"{export_coco(dataset, to, split, boxes)} images in {to}")
+    from synthetless.exports.coco import export_coco
+
+    say(f"{export_coco(dataset, to, split, boxes)} images in {to}")
 
 
 def webdataset_command(
@@ -59,9 +61,11 @@ def webdataset_command(
 
     The labels are in .gt_canonical.json.
     """
+    from synthetless.exports.webdataset import export_webdataset, relabel_webdataset
+
     if relabel_only:
         relabel_webdataset(dataset, to, split)
-        print(f"labels renewed in {to}")
+        say(f"labels renewed in {to}")
         return
     shards = export_webdataset(dataset, to, split, images_per_shard, shuffle_seed)
-    print(f"{len(shards)} images in {len(set(shards.values()))} shards in {to}")
+    say(f"{len(shards)} images in {len(set(shards.values()))} shards in {to}")

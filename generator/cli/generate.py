@@ -4,42 +4,38 @@ from __future__ import annotations
 
 import json
 import os
-import sys
-import textwrap
 from dataclasses import asdict
-from itertools import groupby
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from typer.core import TyperCommand
 
-from synthetless.config import Recipe, load_recipe, settings
-from synthetless.dataset.layout import SHEET_FILE, Part
-from synthetless.errors import UserError
-from synthetless.generation import devices
-from synthetless.generation.devices import Devices
-from synthetless.generation.drop import DropFailed
-from synthetless.generation.estimate import estimate
-from synthetless.generation.generate import Execution, Summary, generate, retry
-from synthetless.generation.rerender import render_again
-from synthetless.io.cache import CACHE_VARIABLE
-from synthetless.io.files import atomic_write
-from synthetless.io.images import encode_png
+from synthetless.cli.terminal import EXIT_FAILED, EXIT_INTERRUPTED, leave, say
 from synthetless.scenes.blender import Kind
 
-EXIT_FAILED, EXIT_WRONG_REQUEST, EXIT_INTERRUPTED = 1, 2, 130
+if TYPE_CHECKING:
+    from synthetless.config import Recipe
+    from synthetless.generation.generate import Summary
 
 Device = Literal["auto", Kind]
 
 
-def leave(message: str, code: int) -> NoReturn:
-    """End with one line on stderr."""
-    print(f"synthetless: {' '.join(message.split())}", file=sys.stderr)
-    sys.exit(code)
+class GenerateCommand(TyperCommand):
+    """Has the settings of a recipe below its help; they are read only when the help is asked for."""
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        self.epilog = settings_help()
+        super().format_epilog(ctx, formatter)
 
 
 def settings_help() -> str:
     """All settings of a recipe, a paragraph for each group; \\b keeps it as it is laid out."""
+    import textwrap
+    from itertools import groupby
+
+    from synthetless.config import settings
+
     paragraphs = []
     for _, group in groupby(settings(), key=lambda setting: setting.key.rpartition(".")[0]):
         lines = ["\b"]
@@ -52,7 +48,7 @@ def settings_help() -> str:
 
 def generate_command(
     recipe: Annotated[Path, typer.Argument(help="The recipe, a YAML file.")],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the dataset. Run again to go on with it.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the dataset. Run again to continue it.")],
     images: Annotated[
         int | None, typer.Option(metavar="N", help="How many images; more than before extends the dataset.")
     ] = None,
@@ -99,6 +95,13 @@ def generate_command(
 
     Example: synthetless generate configs/demo.yaml --out out/demo --set camera.distance_m='[0.5, 0.8]'
     """
+    from synthetless.dataset.layout import Part
+    from synthetless.errors import UserError
+    from synthetless.generation import devices
+    from synthetless.generation.estimate import estimate
+    from synthetless.generation.generate import Execution, generate
+    from synthetless.io.cache import CACHE_VARIABLE
+
     if no_cache:
         os.environ[CACHE_VARIABLE] = "off"  # for the workers, too, which inherit it
     resolved = _resolve(recipe, overrides or [], images, seed, models, textures)
@@ -109,18 +112,18 @@ def generate_command(
         threads,
         drop_limit,
         Part.parse(part) if part else None,
-        devices.choose(on) if executor == "local" else Devices(on),
+        devices.choose(on) if executor == "local" else devices.Devices(on),
         preview_every,
         (address or "auto") if executor == "ray" else None,
     )
     if dry_run:
         plan = estimate(resolved, out, execution)
-        print(json.dumps(asdict(plan)) if as_json else plan)
+        say(json.dumps(asdict(plan)) if as_json else plan)
         return
     try:
         summary = generate(resolved, out, execution)
-    except KeyboardInterrupt:  # here, since typer would end without a word
-        leave("interrupted; run the same command again to go on", EXIT_INTERRUPTED)
+    except KeyboardInterrupt:
+        leave("interrupted; run the same command again to continue", EXIT_INTERRUPTED)
     _report(summary, out, as_json)
     if summary.failures:
         raise typer.Exit(EXIT_FAILED)
@@ -129,6 +132,8 @@ def generate_command(
 def _resolve(
     recipe: Path, overrides: list[str], images: int | None, seed: int | None, models: str | None, textures: str | None
 ) -> Recipe:
+    from synthetless.config import load_recipe
+
     given: list[tuple[str, Any]] = [
         ("images", images),
         ("seed", seed),
@@ -140,6 +145,8 @@ def _resolve(
 
 
 def _report(summary: Summary, out: Path, as_json: bool) -> None:
+    from synthetless.dataset.layout import SHEET_FILE
+
     if as_json:
         answer = {
             "images": summary.images,
@@ -149,17 +156,17 @@ def _report(summary: Summary, out: Path, as_json: bool) -> None:
             "failures": summary.failures,
             "dataset": str(out),
         }
-        print(json.dumps(answer))
+        say(json.dumps(answer))
         return
-    print(
+    say(
         f"{summary.images} images ({summary.made} new), {summary.instances} instances, "
         f"{summary.mean_visib_fract:.0%} visible on average, {len(summary.failures)} failed drops"
     )
     for failure in summary.failures:
-        print(f"  {failure}")
-    print(f"dataset: {out}")
+        say(f"  {failure}")
+    say(f"dataset: {out}")
     if (out / SHEET_FILE).exists():
-        print(f"picture: {out / SHEET_FILE}")
+        say(f"picture: {out / SHEET_FILE}")
 
 
 def render_command(
@@ -172,8 +179,12 @@ def render_command(
     ] = None,
 ) -> None:
     """Render one recorded image again."""
+    from synthetless.generation.rerender import render_again
+    from synthetless.io.files import atomic_write
+    from synthetless.io.images import encode_png
+
     atomic_write(to, encode_png(render_again(dataset, scene, image, textures)))
-    print(to)
+    say(to)
 
 
 def redo_command(
@@ -187,8 +198,11 @@ def redo_command(
 
     It is made alone, in the foreground, and put where it is missing.
     """
+    from synthetless.generation.drop import DropFailed
+    from synthetless.generation.generate import retry
+
     try:
         made = retry(dataset, drop, textures)
     except DropFailed as failure:
         leave(f"drop {drop}: {failure}", EXIT_FAILED)
-    print(f"drop {drop}: {made} images in {dataset}")
+    say(f"drop {drop}: {made} images in {dataset}")

@@ -8,13 +8,8 @@ from typing import Annotated
 
 import typer
 
-from synthetless.cli.generate import EXIT_FAILED
 from synthetless.cli.options import Split, Workers
-from synthetless.doctor import examine, is_fit, to_json, to_text
-from synthetless.io.files import read_json
-from synthetless.preview import write_preview
-from synthetless.preview.pages import STATISTICS_FILE
-from synthetless.validation import validate
+from synthetless.cli.terminal import EXIT_FAILED, say
 
 
 def doctor_command(
@@ -25,8 +20,10 @@ def doctor_command(
 
     Says what to do where it cannot; then the exit code is 1.
     """
+    from synthetless.doctor import examine, is_fit, to_json, to_text
+
     checks = examine(out)
-    print(to_json(checks) if as_json else to_text(checks))
+    say(to_json(checks) if as_json else to_text(checks))
     if not is_fit(checks):
         raise typer.Exit(EXIT_FAILED)
 
@@ -42,9 +39,13 @@ def preview_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print the statistics as JSON.")] = False,
 ) -> None:
     """Make a gallery and statistics for the browser."""
+    from synthetless.io.files import read_json
+    from synthetless.preview import write_preview
+    from synthetless.preview.pages import STATISTICS_FILE
+
     page = write_preview(dataset, to, split, images, workers)
     statistics = read_json(page.parent / STATISTICS_FILE)
-    print(json.dumps({"page": str(page), "statistics": statistics}) if as_json else f"preview: {page}")
+    say(json.dumps({"page": str(page), "statistics": statistics}) if as_json else f"preview: {page}")
 
 
 def validate_command(
@@ -62,7 +63,9 @@ def validate_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Check every file, every label, and both against each other."""
+    from synthetless.validation import validate
+
     found = validate(dataset, deep, exports or (), limit)
-    print(json.dumps(found.to_json()) if as_json else "\n".join(found.lines()))
+    say(json.dumps(found.to_json()) if as_json else "\n".join(found.lines()))
     if not found.valid:
         raise typer.Exit(EXIT_FAILED)

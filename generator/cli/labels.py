@@ -10,12 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from synthetless.cli.options import Workers
-from synthetless.dataset.card import write_card
-from synthetless.dataset.relabel import adopt, relabel
-from synthetless.symmetry import SymmetryTable
-from synthetless.symmetry.detection import detect_folder, report
-from synthetless.symmetry.detection.pictures import draw_detected, draw_table
-from synthetless.symmetry.detection.report import describe
+from synthetless.cli.terminal import say
 
 TableOption = Annotated[
     Path | None,
@@ -38,10 +33,13 @@ def relabel_command(
 
     Images, masks and poses stay as they are. Without options all labels are made again from symmetries.json.
     """
+    from synthetless.dataset.card import write_card
+    from synthetless.dataset.relabel import relabel
+
     done = relabel(dataset, symmetries, scheme, dry_run)
     if not dry_run:
         write_card(dataset)
-    print(json.dumps(asdict(done)) if as_json else done)
+    say(json.dumps(asdict(done)) if as_json else done)
 
 
 def adopt_command(
@@ -53,7 +51,9 @@ def adopt_command(
     scheme: SchemeOption = None,
 ) -> None:
     """Label an existing BOP dataset; its own files stay as they are."""
-    print(adopt(dataset, models, symmetries, scheme))
+    from synthetless.dataset.relabel import adopt
+
+    say(adopt(dataset, models, symmetries, scheme))
 
 
 def detect_command(
@@ -76,14 +76,18 @@ def detect_command(
 
     The report also tells what every other group would leave as residual.
     """
+    from synthetless.symmetry.detection import detect_folder, report
+
     detected = detect_folder(models, tolerance_percent, scale, workers)
     if out is not None:
         detected.table().write(out)
     if models_out is not None:
         detected.write_models(models_out)
     if pictures is not None:
+        from synthetless.symmetry.detection.pictures import draw_detected
+
         draw_detected(detected, pictures, workers)
-    print(json.dumps(detected.to_json()) if as_json else report(detected))
+    say(json.dumps(detected.to_json()) if as_json else report(detected))
 
 
 def show_command(
@@ -95,7 +99,12 @@ def show_command(
 
     Regressors, margins, and which views are dangerous.
     """
+    from synthetless.symmetry import SymmetryTable
+    from synthetless.symmetry.detection.report import describe
+
     read = SymmetryTable.read(table)
     if pictures is not None:
+        from synthetless.symmetry.detection.pictures import draw_table
+
         draw_table(read, models or (table if table.is_dir() else table.parent), pictures)
-    print(describe(read))
+    say(describe(read))

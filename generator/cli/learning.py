@@ -9,8 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from synthetless.cli.options import Split, Workers
-from synthetless.config import BUILTIN, load_settings
-from synthetless.errors import UserError
+from synthetless.cli.terminal import say
 
 _NO_LOSSES = ("step", "seconds", "seconds_left", "rate")
 
@@ -51,9 +50,9 @@ def score_command(
     found = score(judge, results, workers)
     if to is not None:
         write_score_page(found, to)
-    print(json.dumps(found.to_json()) if as_json else to_text(found))
+    say(json.dumps(found.to_json()) if as_json else to_text(found))
     if to is not None and not as_json:
-        print(f"page: {to}")
+        say(f"page: {to}")
 
 
 def compare_command(
@@ -65,6 +64,9 @@ def compare_command(
     ] = "true,map,pitteri2019,pitteri2019-top,atlas",
     seeds: Annotated[int, typer.Option(min=1, metavar="N", help="Runs of each label set.")] = 3,
     steps: Annotated[int, typer.Option(min=1, metavar="N", help="Batches of a run.")] = 1500,
+    crops: Annotated[
+        int, typer.Option(min=10, metavar="N", help="Crops to learn from; a tenth as many are held out.")
+    ] = 12_000,
     poses: Annotated[
         Literal["upright", "any"], typer.Option(help="upright: parts that stand on a table; any: every rotation.")
     ] = "upright",
@@ -75,6 +77,7 @@ def compare_command(
     Trains the same small network on ray-cast crops under several label sets.
     """
     need_torch()
+    from synthetless.config import BUILTIN
     from synthetless.generation.sources import BUILTIN_MODELS
     from synthetless.learning.compare import COLUMNS, Comparison, compare, table_rows
     from synthetless.learning.stream import CropSettings
@@ -85,14 +88,16 @@ def compare_command(
         tuple(_words(labels)),  # type: ignore[arg-type]  # it checks
         seeds,
         steps,
+        train_crops=crops,
+        validation_crops=crops // 10,
         crops=CropSettings(poses=poses),
     )
     runs = compare(comparison, out, workers)
     rows = [COLUMNS, *table_rows(runs, comparison.labels)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(COLUMNS))]
     for row in rows:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-    print(f"page: {out / 'index.html'}")
+        say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    say(f"page: {out / 'index.html'}")
 
 
 def need_torch() -> None:
@@ -101,6 +106,8 @@ def need_torch() -> None:
     Raises:
         UserError: torch cannot be imported.
     """
+    from synthetless.errors import UserError
+
     try:
         import torch  # noqa: F401
     except ImportError as error:
@@ -112,6 +119,8 @@ def _words(text: str) -> list[str]:
 
 
 def _numbers(option: str, text: str) -> list[int]:
+    from synthetless.errors import UserError
+
     try:
         return [int(word) for word in _words(text)]
     except ValueError:
@@ -139,6 +148,7 @@ def train_command(
     Several GPUs: torchrun --nproc-per-node N -m synthetless train CONFIG ...
     """
     need_torch()
+    from synthetless.config import load_settings
     from synthetless.learning.settings import Training
     from synthetless.learning.train import PAGE_FILE, train
 
@@ -149,10 +159,10 @@ def train_command(
     def tell(record: dict[str, Any]) -> None:
         shown = ", ".join(f"{name} {value:.3f}" for name, value in record.items() if name not in _NO_LOSSES)
         left = record["seconds_left"]
-        print(f"step {record['step']} of {steps}: {shown}; {left / 60:.0f} min left", flush=True)
+        say(f"step {record['step']} of {steps}: {shown}; {left / 60:.0f} min left")
 
     train(training, data, out, device, models, tell)
-    print(f"run: {out}\ncurves: {out / PAGE_FILE}")
+    say(f"run: {out}\ncurves: {out / PAGE_FILE}")
 
 
 def predict_command(
@@ -173,4 +183,4 @@ def predict_command(
     from synthetless.learning.predict import predict
 
     count = predict(run, dataset, to, overlays, split, device)
-    print(f"{count} poses in {to}")
+    say(f"{count} poses in {to}")

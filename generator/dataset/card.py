@@ -6,17 +6,18 @@ Format: https://huggingface.co/docs/hub/datasets-cards. The same dataset gives t
 from __future__ import annotations
 
 import re
-from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from synthetless.config import BUILTIN, Recipe
 from synthetless.dataset.layout import CARD_FILE, DATASET_FILE, SYMMETRIES_FILE, ScenePaths, scene_ids
-from synthetless.dataset.reader import read_entries
+from synthetless.dataset.reader import Scene, read_recipe
 from synthetless.io.files import atomic_write, read_json
 from synthetless.symmetry import SymmetryTable
 
@@ -45,29 +46,27 @@ _FILES = {
 }
 
 
-@dataclass
-class ObjectStatistics:
-    """How often an object is to be seen, and how well.
+@dataclass(frozen=True)
+class ObjectCounts:
+    """How often an object is in the images, and how much of it is visible.
 
     Attributes:
         instances: in all images.
-        visible: sum of their visible fractions.
-        regressors: instances by regressor index.
-        n_regressors: how many the object has.
+        mean_visib_fract: of them.
+        regressors: instances of each regressor.
     """
 
-    instances: int = 0
-    visible: float = 0.0
-    regressors: Counter[int] = field(default_factory=Counter)
-    n_regressors: int = 0
+    instances: int
+    mean_visib_fract: float
+    regressors: tuple[int, ...]
 
 
 @dataclass(frozen=True)
-class Statistics:
+class Counts:
     """What is in a dataset: number of images, and each object by its id."""
 
     images: int
-    objects: Mapping[int, ObjectStatistics]
+    objects: Mapping[int, ObjectCounts]
 
     @property
     def instances(self) -> int:
@@ -82,16 +81,16 @@ def write_card(dataset: Path) -> None:
         UserError: the dataset is incomplete or damaged, or the file cannot be written.
     """
     header = read_json(dataset / DATASET_FILE)
-    recipe = Recipe.model_validate(header["recipe"])
-    statistics = _count(dataset, recipe.split)
+    recipe = read_recipe(dataset)
+    counts = _count(dataset, recipe.split)
     table = SymmetryTable.read(dataset / SYMMETRIES_FILE)
     licence = _licence(recipe)
     parts = [
-        _front_matter(recipe, statistics, licence),
-        _what(recipe, statistics, header),
+        _front_matter(recipe, counts, licence),
+        _what(recipe, counts, header),
         _contents(recipe, table),
         _making(recipe),
-        _objects(statistics, table),
+        _objects(counts, table),
         _loading(recipe),
         _terms(recipe, licence),
     ]
@@ -103,18 +102,26 @@ def escape(text: str) -> str:
     return re.sub(r"([\\`*_{}\[\]<>#!|~$&:@])", r"\\\1", " ".join(text.split()))
 
 
-def _count(dataset: Path, split: str) -> Statistics:
-    images, objects = 0, defaultdict[int, ObjectStatistics](ObjectStatistics)
+def _count(dataset: Path, split: str) -> Counts:
+    images, rows = 0, [np.empty((0, 4))]
     for scene_id in scene_ids(dataset, split) if (dataset / split).is_dir() else ():
-        for labels in read_entries(ScenePaths.of(dataset, scene_id, split)):
-            images += 1
-            for info, label in zip(labels.gt_info, labels.gt_canonical, strict=True):
-                of_object = objects[label["obj_id"]]
-                of_object.instances += 1
-                of_object.visible += info["visib_fract"]
-                of_object.regressors[label["regressor_index"]] += 1
-                of_object.n_regressors = label["n_regressors"]
-    return Statistics(images, dict(sorted(objects.items())))
+        scene = Scene.read(ScenePaths.of(dataset, scene_id, split))
+        poses, labels, visibility = scene.labelled()
+        images += len(scene)
+        rows.append(
+            np.column_stack([poses.obj_ids, visibility.visib_fract, labels.regressor_index, labels.n_regressors])
+        )
+    every = np.concatenate(rows)
+    return Counts(
+        images, {int(obj_id): _count_object(every[every[:, 0] == obj_id, 1:]) for obj_id in np.unique(every[:, 0])}
+    )
+
+
+def _count_object(rows: NDArray[np.float64]) -> ObjectCounts:
+    """From (N, 3): visible fraction, regressor index and number of regressors of an object's instances."""
+    visib_fract, index, n_regressors = rows.T
+    regressors = np.bincount(index.astype(np.int64), minlength=int(n_regressors.max()))
+    return ObjectCounts(len(rows), float(visib_fract.mean()), tuple(regressors.tolist()))
 
 
 def _licence(recipe: Recipe) -> str:
@@ -130,8 +137,8 @@ def _licence_id(licence: str) -> str:
     return named[0] if len(named) == 1 else "other"
 
 
-def _front_matter(recipe: Recipe, statistics: Statistics, licence: str) -> str:
-    size = next((name for limit, name in _SIZES if statistics.images < limit), "1M<n<10M")
+def _front_matter(recipe: Recipe, counts: Counts, licence: str) -> str:
+    size = next((name for limit, name in _SIZES if counts.images < limit), "1M<n<10M")
     content: dict[str, Any] = {
         "license": _licence_id(licence),
         "task_categories": ["object-detection", *(task for key, task in _TASKS.items() if key in recipe.outputs)],
@@ -143,12 +150,12 @@ def _front_matter(recipe: Recipe, statistics: Statistics, licence: str) -> str:
     return f"---\n{yaml.safe_dump(content, sort_keys=False, allow_unicode=True)}---"
 
 
-def _what(recipe: Recipe, statistics: Statistics, header: Mapping[str, Any]) -> str:
+def _what(recipe: Recipe, counts: Counts, header: Mapping[str, Any]) -> str:
     versions = ", ".join(f"{escape(name)} {escape(str(value))}" for name, value in header.get("versions", {}).items())
-    mean = statistics.instances / statistics.images if statistics.images else 0.0
+    mean = counts.instances / counts.images if counts.images else 0.0
     return (
         f"# {escape(recipe.name)}\n\n"
-        f"{statistics.images} synthetic images with {statistics.instances} instances of {len(statistics.objects)} "
+        f"{counts.images} synthetic images with {counts.instances} instances of {len(counts.objects)} "
         f"objects ({mean:.1f} an image), for 6D pose estimation of texture-less, symmetric parts. Objects fall onto a "
         "table and are rendered with Blender Cycles; poses, depth and masks are exact. Every pose also "
         "comes with an unambiguous, learnable label: a canonical pose that is the same for all poses that look alike.\n"
@@ -209,17 +216,17 @@ def _visibility(delta_mm: float) -> str:
     return f"what is the nearest surface{behind}"
 
 
-def _objects(statistics: Statistics, table: SymmetryTable) -> str:
+def _objects(counts: Counts, table: SymmetryTable) -> str:
     rows = []
-    for obj_id, of_object in statistics.objects.items():
-        shares = [of_object.regressors[index] / of_object.instances for index in range(of_object.n_regressors)]
+    for obj_id, of_object in counts.objects.items():
+        shares = [count / of_object.instances for count in of_object.regressors]
         rows.append(
             (
                 str(obj_id),
                 table.entries[obj_id].group.name if obj_id in table.entries else "",
                 str(of_object.instances),
-                f"{of_object.visible / of_object.instances:.1%}",
-                str(of_object.n_regressors),
+                f"{of_object.mean_visib_fract:.1%}",
+                str(len(of_object.regressors)),
                 " / ".join(f"{share:.0%}" for share in shares),
             )
         )

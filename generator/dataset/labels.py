@@ -18,6 +18,9 @@ from synthetless.symmetry import CanonicalMap, CanonicalPoses, SymmetryTable
 
 Floats = NDArray[np.float64]
 
+BOX_EDGES = tuple((i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if not i & bit)
+"""The 12 edges of ``box_corners_mm``, as pairs of corners that differ along one axis."""
+
 
 def label_scene(
     scene_gt: Mapping[int, Sequence[GtEntry]],

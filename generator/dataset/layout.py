@@ -29,7 +29,19 @@ RECORDS_FOLDER = ".records"
 FAILURES_FOLDER = ".failures"
 LOGS_FOLDER = ".logs"
 SPLIT = "train_synthetless"
+PREVIEW_FOLDER = "preview"
 _MODELS_FOLDERS = (MODELS_FOLDER, "models_cad", "models_eval")
+_RESERVED = (
+    DATASET_FILE,
+    SYMMETRIES_FILE,
+    CAMERA_FILE,
+    CARD_FILE,
+    SHEET_FILE,
+    PREVIEW_FOLDER,
+    SPLIT,
+    *_MODELS_FOLDERS,
+)
+"""Names in a dataset's folder that nothing else may have, whether they are there or not."""
 
 IMAGES_PER_SCENE = 1000
 FIRST_SCENE = 1
@@ -180,7 +192,8 @@ def scene_ids(dataset: Path, split: str = SPLIT) -> list[int]:
     """
     folder = dataset / split
     if not folder.is_dir():
-        raise UserError(f"{folder}: no such split; give the folder of a BOP dataset that holds {split}/000001")
+        known = ", ".join(sorted({paths.root.parent.name for paths in scene_folders(dataset, ["scene_camera.json"])}))
+        raise UserError(f"{folder}: no such split; {f'there are {known}' if known else 'this is no BOP dataset'}")
     ids = sorted(int(entry.name) for entry in folder.iterdir() if entry.name.isdecimal() and entry.is_dir())
     if not ids:
         raise UserError(f"{folder}: holds no scene folders (000001, ...)")
@@ -191,6 +204,39 @@ def scene_folders(root: Path, having: Iterable[str]) -> list[ScenePaths]:
     """The scene folders SPLIT/%06d of all splits that have one of these files, in order."""
     folders = {path.parent for name in having for path in root.glob(f"*/*/{name}")}
     return [ScenePaths(folder) for folder in sorted(folders) if folder.name.isdecimal()]
+
+
+def refuse_target(root: Path, to: Path, own: str | None = None) -> None:
+    """Keep an answer about a dataset from taking the place of what the dataset consists of.
+
+    An answer may lie outside the dataset's folder, or in it under a name that is free.
+
+    Args:
+        root: the dataset's folder.
+        to: the file or folder that is to be written; links in both are followed.
+        own: name of a folder that is reserved for this kind of answer.
+
+    Raises:
+        UserError: the target is the dataset's folder, holds it, or belongs to it.
+    """
+    target, folder = _without_links(to), _without_links(root)
+    if folder.is_relative_to(target):
+        raise UserError(f"{to}: holds the dataset {root}; give another target")
+    reserved = {folder / name for name in _RESERVED if name != own}
+    for path in folder.iterdir() if folder.is_dir() else ():
+        scenes = [child for child in path.iterdir() if child.name.isdecimal()] if path.is_dir() else []
+        if scenes or path.name.startswith(".") or path in reserved:
+            reserved |= {path, *map(_without_links, (path, *scenes))}
+    inside = target.relative_to(folder).parts[0] if target.is_relative_to(folder) else ""
+    if inside.startswith(".") or any(target.is_relative_to(path) for path in reserved):
+        raise UserError(f"{to}: belongs to the dataset {root}; give a target outside, or a new name in its folder")
+
+
+def _without_links(path: Path) -> Path:
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError) as error:  # a link that leads to itself
+        raise UserError(f"{path}: cannot be followed ({error})") from None
 
 
 def find_models_folder(root: Path) -> Path:

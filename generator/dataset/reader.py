@@ -4,18 +4,19 @@
 scenes, images and instances. Nothing is written, no file is kept open; Blender and torch are not needed. One object may
 be shared by threads, and is pickled as its path: a process that gets it reads for itself.
 
-Below it are the two forms in which the rest of the package reads a scene folder: its JSON records (``read_entries``)
-and its poses (``ScenePoses``).
+Below it are the two forms in which the rest of the package reads a scene folder: in columns (``Scene``), and as the
+JSON records that stand there (``read_entries``).
 """
 
 from __future__ import annotations
 
+import operator
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, TypeVar, overload
+from typing import Any, SupportsIndex, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,9 @@ from synthetless.dataset.layout import (
 from synthetless.dataset.records import (
     CameraEntry,
     CanonicalEntry,
+    ForeignCameraEntry,
+    ForeignGtEntry,
+    ForeignGtInfoEntry,
     GtEntry,
     GtInfoEntry,
     ImageSpec,
@@ -47,7 +51,9 @@ from synthetless.symmetry import SymmetryTable
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-Place = TypeVar("Place")
+Kind = TypeVar("Kind")
+Where = Callable[[int], str]
+"""Names a row's place for a message: file, image and instance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +184,7 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """Columns of ``Label``, one row for each of N instances."""
+    """Columns of ``Label``, one row for each of N instances; ``corners_px`` is (N, 8, 2)."""
 
     R_m2c: Floats
     t_m2c: Floats
@@ -188,26 +194,26 @@ class Labels:
     corners_px: Floats
 
     @classmethod
-    def of(cls, entries: Sequence[CanonicalEntry]) -> Labels:
-        """The columns of entries of scene_gt_canonical.json."""
+    def of(cls, entries: Sequence[CanonicalEntry], where: Where) -> Labels:
+        """The columns of entries of scene_gt_canonical.json; a UserError names a damaged one."""
         return cls(
-            _column(entries, "cam_R_m2c_canonical", 3, 3),
-            _column(entries, "cam_t_m2c_canonical", 3),
-            _column(entries, "regressor_index").astype(np.int64),
-            _column(entries, "n_regressors").astype(np.int64),
-            _column(entries, "discontinuity_margin_deg"),
-            _column(entries, "bbox3d_corners_2d", 8, 2),
+            _column(entries, "cam_R_m2c_canonical", where, 9).reshape(-1, 3, 3),
+            _column(entries, "cam_t_m2c_canonical", where, 3),
+            _whole_column(entries, "regressor_index", where),
+            _whole_column(entries, "n_regressors", where),
+            _column(entries, "discontinuity_margin_deg", where),
+            _column(entries, "bbox3d_corners_2d", where, 8, 2),
         )
 
     def row(self, number: int) -> Label:
         """The label of one instance."""
         return Label(
-            self.R_m2c[number],
-            self.t_m2c[number],
+            self.R_m2c[number].copy(),
+            self.t_m2c[number].copy(),
             int(self.regressor_index[number]),
             int(self.n_regressors[number]),
             float(self.discontinuity_margin_deg[number]),
-            self.corners_px[number],
+            self.corners_px[number].copy(),
         )
 
 
@@ -221,14 +227,14 @@ class Visibilities:
     bbox_visib: Integers
 
     @classmethod
-    def of(cls, entries: Sequence[GtInfoEntry]) -> Visibilities:
-        """The columns of entries of scene_gt_info.json."""
-        counts = [_column(entries, f"px_count_{what}") for what in ("all", "valid", "visib")]
+    def of(cls, entries: Sequence[GtInfoEntry], where: Where) -> Visibilities:
+        """The columns of entries of scene_gt_info.json; a UserError names a damaged one."""
+        counts = [_whole_column(entries, f"px_count_{what}", where) for what in ("all", "valid", "visib")]
         return cls(
-            _column(entries, "visib_fract"),
-            np.stack(counts, axis=1).astype(np.int64),
-            _column(entries, "bbox_obj", 4).astype(np.int64),
-            _column(entries, "bbox_visib", 4).astype(np.int64),
+            _column(entries, "visib_fract", where),
+            np.stack(counts, axis=1),
+            _whole_column(entries, "bbox_obj", where, 4),
+            _whole_column(entries, "bbox_visib", where, 4),
         )
 
     def row(self, number: int) -> Visibility:
@@ -268,20 +274,18 @@ class ScenePoses:
                 raise UserError(f"scene_gt.json: image {im_id} has no list of instances")
             if not isinstance(scene_camera.get(im_id), dict):
                 raise UserError(f"scene_camera.json: image {im_id} of scene_gt.json has no entry")
-        places = [(im_id, gt_id) for im_id, entries in scene_gt.items() for gt_id in range(len(entries))]
+        image_ids = np.array(list(scene_gt), dtype=np.int64)
+        first = np.cumsum([0, *(len(entries) for entries in scene_gt.values())])
         every = [entry for entries in scene_gt.values() for entry in entries]
-        for place, entry in zip(places, every, strict=True):
-            if not isinstance(entry.get("obj_id"), int):
-                raise UserError(f"{_instance(place)}: obj_id is {entry.get('obj_id')!r}, not a whole number")
-        counts = [len(entries) for entries in scene_gt.values()]
-        K = _rows([scene_camera[im_id].get("cam_K") for im_id in scene_gt], 9, "cam_K", list(scene_gt), _image)
+        cameras = [scene_camera[im_id] for im_id in scene_gt]
+        in_gt = _in_file("scene_gt.json", image_ids, first)
         return cls(
-            np.array(list(scene_gt), dtype=np.int64),
-            np.cumsum([0, *counts]),
-            K.reshape(-1, 3, 3),
-            np.array([entry["obj_id"] for entry in every], dtype=np.int64),
-            _rows([entry.get("cam_R_m2c") for entry in every], 9, "cam_R_m2c", places, _instance).reshape(-1, 3, 3),
-            _rows([entry.get("cam_t_m2c") for entry in every], 3, "cam_t_m2c", places, _instance),
+            image_ids,
+            first,
+            _column(cameras, "cam_K", _in_file("scene_camera.json", image_ids), 9).reshape(-1, 3, 3),
+            _whole_column(every, "obj_id", in_gt),
+            _column(every, "cam_R_m2c", in_gt, 9).reshape(-1, 3, 3),
+            _column(every, "cam_t_m2c", in_gt, 3),
         )
 
     @property
@@ -291,13 +295,12 @@ class ScenePoses:
 
     def place(self, row: int) -> str:
         """File, image and instance of a row, for messages."""
-        image = int(np.searchsorted(self.first, row, side="right")) - 1
-        return _instance((int(self.image_ids[image]), row - int(self.first[image])))
+        return _in_file("scene_gt.json", self.image_ids, self.first)(row)
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A scene folder in columns: M images, N instances.
+    """A scene folder in columns: M images, N instances. The arrays are shared and cannot be written to.
 
     Attributes:
         paths: its files.
@@ -323,25 +326,56 @@ class Scene:
         Raises:
             UserError: one is damaged, or they disagree about the images or their instances.
         """
-        entries = read_entries(paths, partly=True)
-        gt = {image.im_id: image.gt for image in entries}
-        camera = {image.im_id: image.camera for image in entries}
-        poses = ScenePoses.of(gt, camera)
+        entries = _read_entries(paths, partly=True)
         try:
-            canonical = [label for image in entries for label in image.gt_canonical]
-            info = [entry for image in entries for entry in image.gt_info]
-            placed = all("cam_R_w2c" in entry and "cam_t_w2c" in entry for entry in camera.values())
-            return cls(
-                paths,
-                poses,
-                np.array([entry.get("depth_scale", 1.0) for entry in camera.values()], dtype=np.float64),
-                _column(list(camera.values()), "cam_R_w2c", 3, 3) if placed else None,
-                _column(list(camera.values()), "cam_t_w2c", 3) if placed else None,
-                Labels.of(canonical) if paths.scene_gt_canonical.exists() else None,
-                Visibilities.of(info) if paths.scene_gt_info.exists() else None,
+            return cls._of(paths, entries)
+        except UserError as error:
+            raise UserError(f"{paths.root}: {error}") from None
+
+    @classmethod
+    def _of(cls, paths: ScenePaths, entries: Sequence[ImageEntries]) -> Scene:
+        poses = ScenePoses.of(
+            {image.im_id: image.gt for image in entries}, {image.im_id: image.camera for image in entries}
+        )
+        cameras = [{"depth_scale": 1.0, **image.camera} for image in entries]
+        canonical = [label for image in entries for label in image.gt_canonical]
+        info = [entry for image in entries for entry in image.gt_info]
+        in_camera, in_canonical, in_info = (
+            _in_file(path.name, poses.image_ids, first)
+            for path, first in (
+                (paths.scene_camera, None),
+                (paths.scene_gt_canonical, poses.first),
+                (paths.scene_gt_info, poses.first),
             )
-        except (KeyError, TypeError, ValueError) as error:
-            raise UserError(f"{paths.root}: an entry of its JSON files is damaged ({error}); see validate") from error
+        )
+        placed = all("cam_R_w2c" in camera and "cam_t_w2c" in camera for camera in cameras)
+        return cls(
+            paths,
+            poses,
+            _column(cameras, "depth_scale", in_camera),
+            _column(cameras, "cam_R_w2c", in_camera, 9).reshape(-1, 3, 3) if placed else None,
+            _column(cameras, "cam_t_w2c", in_camera, 3) if placed else None,
+            Labels.of(canonical, in_canonical) if paths.scene_gt_canonical.exists() else None,
+            Visibilities.of(info, in_info) if paths.scene_gt_info.exists() else None,
+        )
+
+    def __post_init__(self) -> None:
+        for columns in (self, self.poses, self.labels, self.visibility):
+            for column in () if columns is None else vars(columns).values():
+                if isinstance(column, np.ndarray):
+                    column.flags.writeable = False
+
+    def labelled(self) -> tuple[ScenePoses, Labels, Visibilities]:
+        """Poses, labels and visibility, for those who need all of them.
+
+        Raises:
+            UserError: scene_gt_canonical.json or scene_gt_info.json is missing.
+        """
+        if self.labels is None:
+            raise UserError(f"{self.paths.scene_gt_canonical}: not found; adopt writes the labels of a BOP dataset")
+        if self.visibility is None:
+            raise UserError(f"{self.paths.scene_gt_info}: not found; bop_toolkit's calc_gt_info.py writes it")
+        return self.poses, self.labels, self.visibility
 
     def __len__(self) -> int:
         """Number of images."""
@@ -353,10 +387,10 @@ class Scene:
         return Image(
             self.paths,
             int(self.poses.image_ids[number]),
-            self.poses.cameras[number],
+            self.poses.cameras[number].copy(),
             float(self.depth_scale[number]),
-            None if self.R_w2c is None else self.R_w2c[number],
-            None if self.t_w2c is None else self.t_w2c[number],
+            None if self.R_w2c is None else self.R_w2c[number].copy(),
+            None if self.t_w2c is None else self.t_w2c[number].copy(),
             tuple(self._instance(int(self.poses.image_ids[number]), gt_id, row) for gt_id, row in enumerate(rows)),
         )
 
@@ -366,8 +400,8 @@ class Scene:
             im_id,
             gt_id,
             int(self.poses.obj_ids[row]),
-            self.poses.R_m2c[row],
-            self.poses.t_m2c[row],
+            self.poses.R_m2c[row].copy(),
+            self.poses.t_m2c[row].copy(),
             None if self.labels is None else self.labels.row(row),
             None if self.visibility is None else self.visibility.row(row),
         )
@@ -377,12 +411,16 @@ class Dataset(Sequence[Image]):
     """A split of a BOP dataset: a sequence of images, in the order of scene folders and image ids.
 
     The JSON files of a scene folder are read when its first image is asked for, and kept as arrays (about 0.5 kB an
-    instance). ``len`` and access by number read those of all folders.
+    instance). ``len`` and access by number read those of all folders. The arrays of an image and of its instances are
+    copies, which may be changed.
 
     >>> dataset = Dataset.open("out/demo")  # doctest: +SKIP
-    >>> for image in dataset:  # doctest: +SKIP
-    ...     for instance in image.instances:
-    ...         crop, pose = image.rgb(), instance.label.R_m2c
+    >>> image = dataset[0]  # doctest: +SKIP
+    >>> image.key, image.rgb().shape, len(image.instances)  # doctest: +SKIP
+    ('000001_000000', (300, 400, 3), 5)
+    >>> instance = image.instances[0]  # doctest: +SKIP
+    >>> instance.obj_id, instance.R_m2c.shape, instance.label.regressor_index  # doctest: +SKIP
+    (3, (3, 3), 0)
 
     Attributes:
         root: the dataset's folder.
@@ -404,11 +442,14 @@ class Dataset(Sequence[Image]):
             split: may be left out where there is only one.
 
         Raises:
-            UserError: this is no BOP dataset, or the split is not in it.
+            UserError: this is no BOP dataset, the split is not in it, or there are several and none is named.
         """
         root = Path(root)
         split = split or find_split(root)
         return cls(root, split, scene_ids(root, split))
+
+    def __repr__(self) -> str:
+        return f"Dataset({str(self.root)!r}, split {self.split!r}, {len(self.scene_ids)} scene folders)"
 
     def __reduce__(self) -> tuple[Callable[..., Dataset], tuple[Path, str, tuple[int, ...]]]:
         return Dataset, (self.root, self.split, self.scene_ids)
@@ -423,6 +464,14 @@ class Dataset(Sequence[Image]):
         """All scene folders."""
         return (self.scene(scene_id) for scene_id in self.scene_ids)
 
+    def image(self, scene_id: int, im_id: int) -> Image:
+        """The image with these BOP ids; a UserError if there is none."""
+        if scene_id in self.scene_ids:
+            scene = self.scene(scene_id)
+            if (numbers := np.flatnonzero(scene.poses.image_ids == im_id)).size:
+                return scene.image(int(numbers[0]))
+        raise UserError(f"{self.paths(scene_id).root}: no image {im_id}")
+
     def paths(self, scene_id: int) -> ScenePaths:
         """The files of a scene folder."""
         return ScenePaths.of(self.root, scene_id, self.split)
@@ -434,15 +483,16 @@ class Dataset(Sequence[Image]):
         return (scene.image(number) for scene in self.scenes() for number in range(len(scene)))
 
     @overload
-    def __getitem__(self, number: int) -> Image: ...
+    def __getitem__(self, number: SupportsIndex) -> Image: ...
     @overload
     def __getitem__(self, number: slice) -> list[Image]: ...
-    def __getitem__(self, number: int | slice) -> Image | list[Image]:
+    def __getitem__(self, number: SupportsIndex | slice) -> Image | list[Image]:
         if isinstance(number, slice):
             return [self[i] for i in range(*number.indices(len(self)))]
-        index = number + len(self) if number < 0 else number
+        index = operator.index(number)  # a whole number of any type, numpy's included
+        index += len(self) if index < 0 else 0
         if not 0 <= index < len(self):
-            raise IndexError(f"image {number} of {len(self)}")
+            raise IndexError(f"{self.root}: image {number} of {len(self)}; 0 to {len(self) - 1} are possible")
         scene = int(np.searchsorted(self._ends, index, side="right")) - 1
         return self.scene(self.scene_ids[scene]).image(index - int(self._ends[scene]))
 
@@ -485,16 +535,25 @@ class ImageEntries:
     gt_canonical: list[CanonicalEntry]
 
 
-def read_entries(paths: ScenePaths, partly: bool = False) -> list[ImageEntries]:
-    """The records of a scene folder's images, in ascending order.
-
-    Args:
-        paths: the scene folder.
-        partly: also where scene_gt_info.json or scene_gt_canonical.json is missing; its lists are empty then.
+def read_entries(paths: ScenePaths) -> list[ImageEntries]:
+    """The records of a scene folder's images, in ascending order, unchanged: with what others wrote beside.
 
     Raises:
         UserError: a file is missing or damaged, or the files disagree about the images or their instances.
     """
+    entries = _read_entries(paths)
+    for path, schema, content in (
+        (paths.scene_camera, ForeignCameraEntry, {image.im_id: image.camera for image in entries}),
+        (paths.scene_gt, list[ForeignGtEntry], {image.im_id: image.gt for image in entries}),
+        (paths.scene_gt_info, list[ForeignGtInfoEntry], {image.im_id: image.gt_info for image in entries}),
+        (paths.scene_gt_canonical, list[CanonicalEntry], {image.im_id: image.gt_canonical for image in entries}),
+    ):
+        validated(schema_of(dict[int, schema]), content, path)  # type: ignore[valid-type]
+    return entries
+
+
+def _read_entries(paths: ScenePaths, partly: bool = False) -> list[ImageEntries]:
+    """The records as they stand there; ``partly`` also where those of visibility or labels are missing."""
     cameras = read_scene_json(paths.scene_camera)
     gts = read_scene_json(paths.scene_gt)
     info, canonical = (
@@ -518,20 +577,30 @@ def read_specs(paths: ScenePaths) -> dict[int, ImageSpec]:
     """
     if not paths.scene_spec.exists():
         return {}
-    adapter = spec_schema()
-    try:
-        specs = [adapter.validate_python(line) for line in read_json_lines(paths.scene_spec)]
-    except ValidationError as error:
-        fault = error.errors()[0]
-        place = ".".join(str(part) for part in fault["loc"])
-        raise UserError(f"{paths.scene_spec}: {place}: {fault['msg']}") from None
+    adapter = schema_of(ImageSpec)
+    specs = [validated(adapter, line, paths.scene_spec) for line in read_json_lines(paths.scene_spec)]
     return {spec.image_id: spec for spec in specs}
 
 
 @cache
-def spec_schema() -> TypeAdapter[ImageSpec]:
-    """The schema of a line of scene_spec.jsonl; made once, since that takes long."""
-    return TypeAdapter(ImageSpec)
+def schema_of(kind: type[Kind]) -> TypeAdapter[Kind]:
+    """The schema of a type of JSON data; made once, since that takes long."""
+    return TypeAdapter(kind)
+
+
+def validated(schema: TypeAdapter[Kind], content: Any, path: Path) -> Kind:
+    """The content of a file, held against its schema.
+
+    Raises:
+        UserError: it is otherwise; with the file, the place in it, and what was expected.
+    """
+    try:
+        return schema.validate_python(content)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        place = ".".join(str(part) for part in fault["loc"])
+        found = reprlib.repr(fault["input"])
+        raise UserError(f"{path}: {place}: {fault['msg']}, but it is {found}") from None
 
 
 def read_recipe(root: Path) -> Recipe:
@@ -560,32 +629,43 @@ def _length(entries: Any) -> int:
     return len(entries) if isinstance(entries, list) else 0
 
 
-def _column(entries: Sequence[Mapping[str, Any]], key: str, *shape: int) -> Floats:
-    """(N, *shape) a key's numbers in every entry."""
-    return np.array([entry[key] for entry in entries], dtype=np.float64).reshape(len(entries), *shape)
+def _column(entries: Sequence[Any], key: str, where: Where, *shape: int) -> Floats:
+    """(N, *shape) a key's numbers in every entry; an entry without them is named by its place."""
+    values = [entry.get(key) if isinstance(entry, dict) else None for entry in entries]
+    if (column := as_floats(values)).shape == (len(values), *shape) and np.isfinite(column).all():
+        return column
+    for row, value in enumerate(values):
+        if (numbers := as_floats(value)).shape != shape or not np.isfinite(numbers).all():
+            wanted = " x ".join(map(str, shape)) + " finite numbers" if shape else "a finite number"
+            raise UserError(f"{where(row)}: {key} is {reprlib.repr(value)}, not {wanted}")
+    return np.empty((0, *shape))
 
 
-def _rows(values: list[Any], count: int, name: str, places: list[Place], where: Callable[[Place], str]) -> Floats:
-    """Lists of numbers as an array (N, count); a list of another form is named by its place."""
-    if (array := as_floats(values)).shape == (len(values), count) and np.isfinite(array).all():
-        return array
-    for place, value in zip(places, values, strict=True):
-        if (row := as_floats(value)).shape != (count,) or not np.isfinite(row).all():
-            raise UserError(f"{where(place)}: {name} is {reprlib.repr(value)}, not {count} finite numbers")
-    return np.empty((0, count))
+def _whole_column(entries: Sequence[Any], key: str, where: Where, *shape: int) -> Integers:
+    """The same of whole numbers."""
+    column = _column(entries, key, where, *shape)
+    if (odd := np.argwhere(column != np.floor(column))).size:
+        row = int(odd[0, 0])
+        raise UserError(f"{where(row)}: {key} is {entries[row][key]!r}; whole numbers are needed")
+    return column.astype(np.int64)
 
 
 def as_floats(values: Any) -> Floats:
-    """Nested lists of numbers as an array; one of shape () if they are something else."""
+    """Nested lists of numbers as an array; one of shape () if they are something else, text or null included."""
     try:
-        return np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        return np.empty(())
+        array = np.array(values)
+    except ValueError:  # lists of different lengths
+        return np.full((), np.nan)
+    return array.astype(np.float64) if array.dtype.kind in "iuf" else np.full((), np.nan)
 
 
-def _image(im_id: int) -> str:
-    return f"scene_camera.json: image {im_id}"
+def _in_file(name: str, image_ids: Integers, first: Integers | None = None) -> Where:
+    """Names rows of a file: images, or instances if ``first`` says with which row each image begins."""
 
+    def place(row: int) -> str:
+        if first is None:
+            return f"{name}: image {image_ids[row]}"
+        image = int(np.searchsorted(first, row, side="right")) - 1
+        return f"{name}: image {image_ids[image]}, instance {row - int(first[image])}"
 
-def _instance(place: tuple[int, int]) -> str:
-    return f"scene_gt.json: image {place[0]}, instance {place[1]}"
+    return place

@@ -140,18 +140,24 @@ class DatasetStore:
         Raises:
             UserError: the folder holds something else, or cannot be written.
         """
-        known = root / DATASET_FILE
-        header = _header(recipe, models, scenery_digest)
-        if known.exists():
-            begun_with = read_recipe(root)  # with today's defaults for settings that it did not know
-            _refuse_other(known, {**read_json(known), "recipe": dump_recipe(begun_with)}, header)
-            recipe = recipe.model_copy(update={"images": max(recipe.images, begun_with.images)})
-        else:
+        if not (root / DATASET_FILE).exists():
             make_folder(root)
-            write_json(known, header)
-        dataset = cls(root, recipe)
+            write_json(root / DATASET_FILE, _header(recipe, models, scenery_digest))
+        dataset = cls.begun(root, recipe, models, scenery_digest)
         dataset._write_companions(models)
         return dataset
+
+    @classmethod
+    def begun(cls, root: Path, recipe: Recipe, models: Mapping[int, ObjectModel], scenery_digest: str) -> DatasetStore:
+        """A dataset that was begun before, from the same recipe, models and photographs; nothing is written.
+
+        Raises:
+            UserError: it was begun from others, or dataset.json is missing or damaged.
+        """
+        begun_with = read_recipe(root)  # with today's defaults for settings that it did not know
+        before = {**read_json(root / DATASET_FILE), "recipe": dump_recipe(begun_with)}
+        _refuse_other(root / DATASET_FILE, before, _header(recipe, models, scenery_digest))
+        return cls(root, recipe.model_copy(update={"images": max(recipe.images, begun_with.images)}))
 
     def scene(self, scene_id: int) -> ScenePaths:
         """The files of a scene folder."""
@@ -279,7 +285,7 @@ class DatasetStore:
         folder = self.root / MODELS_FOLDER
         for model in models.values():
             if not (folder / model.path.name).exists():
-                atomic_write(folder / model.path.name, model.path.read_bytes())
+                atomic_write(folder / model.path.name, model.to_ply())
         infos = {str(obj_id): dict(model.info) for obj_id, model in models.items()}
         camera = records.camera_json(self.recipe.intrinsics, self.recipe.encoding.depth_scale)
         for path, content in ((folder / INFO_FILE, infos), (self.root / CAMERA_FILE, camera)):

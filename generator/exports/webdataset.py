@@ -20,19 +20,27 @@ import numpy as np
 from tqdm import tqdm
 
 from synthetless.dataset.labels import refuse_half_labelled
-from synthetless.dataset.layout import ScenePaths, find_split, scene_ids
+from synthetless.dataset.layout import (
+    CARD_FILE,
+    DATASET_FILE,
+    SYMMETRIES_FILE,
+    ScenePaths,
+    find_split,
+    refuse_target,
+    scene_ids,
+)
 from synthetless.dataset.reader import ImageEntries, read_entries
 from synthetless.dataset.records import RunLengths, uncompressed_rle
 from synthetless.errors import UserError
-from synthetless.io.files import atomic_file, atomic_folder, atomic_write, read_bytes, write_json
+from synthetless.io.files import atomic_file, atomic_folder, atomic_write, read_bytes, remove_drafts, write_json
 from synthetless.io.images import decode_mask
 from synthetless.io.parallel import processes
 
 MAX_IMAGES_PER_SHARD = 1000
 """BOP's limit."""
 KEYS_FILE = "key_to_shard.json"
-_COMPANIONS = ("dataset.json", "symmetries.json", "README.md")
-"""Files of the dataset folder that tell what the labels mean, copied beside the shards."""
+_COMPANIONS = (DATASET_FILE, SYMMETRIES_FILE, CARD_FILE)
+"""Files of the dataset folder that say what the labels mean, copied beside the shards."""
 
 Members = dict[str, bytes]
 
@@ -74,12 +82,16 @@ def export_webdataset(
         The number of the shard each key (``{scene:06d}_{im:06d}``) is in.
 
     Raises:
-        UserError: an argument is out of range, the dataset is incomplete, or the folder cannot be written.
+        UserError: an argument is out of range, the dataset is incomplete, or the folder belongs to it, holds something,
+            or cannot be written.
     """
+    refuse_target(dataset, to)
     if not 1 <= images_per_shard <= MAX_IMAGES_PER_SHARD:
         raise UserError(f"images_per_shard is {images_per_shard}; 1 to {MAX_IMAGES_PER_SHARD} are possible")
     refuse_half_labelled(dataset)
     images = list(_images(dataset, split or find_split(dataset)))
+    if not images:
+        raise UserError(f"{dataset}: holds no images to export")
     if shuffle_seed is not None:
         order = np.random.default_rng(np.random.SeedSequence(shuffle_seed)).permutation(len(images))
         images = [images[i] for i in order]
@@ -94,10 +106,10 @@ def export_webdataset(
 def relabel_webdataset(
     dataset: Path, shards: Path, split: str | None = None, workers: int | None = None
 ) -> dict[str, int]:
-    """Renew the labels in exported shards after a change of symmetries; images and masks are copied as they are.
+    """Replace the labels in exported shards after a change of symmetries; images and masks are copied as they are.
 
-    The result equals a fresh export byte for byte. Each shard is replaced as a whole; key_to_shard.json is taken away
-    first and comes back last, so its absence betrays an interrupted run, which is mended by running again.
+    The result equals a fresh export byte for byte. Each shard is replaced as a whole; key_to_shard.json is removed
+    first and written last, so its absence shows an interrupted run, which another run completes.
 
     Args:
         dataset: the dataset folder, relabelled.
@@ -110,6 +122,7 @@ def relabel_webdataset(
     Raises:
         UserError: the shards do not hold the dataset's images, are damaged, or cannot be written.
     """
+    refuse_target(dataset, shards)
     paths = sorted(shards.glob("shard-*.tar"))
     if not paths:
         raise UserError(f"{shards}: holds no shards (shard-000000.tar, ...); export first")
@@ -121,6 +134,7 @@ def relabel_webdataset(
         odd = min(key_to_shard.keys() ^ images.keys())
         place = "shards" if odd in key_to_shard else "dataset"
         raise UserError(f"{shards}: image {odd} is only in the {place}; export the dataset anew")
+    remove_drafts(shards)  # of a run that was killed
     _withdraw(shards / KEYS_FILE)
     tasks = [(path, [images[key] for key in shard]) for path, shard in zip(paths, keys, strict=True)]
     _run(_relabel_shard, tasks, workers)
@@ -178,7 +192,7 @@ def _relabel_shard(task: ShardTask) -> int:
 
 
 def _image_members(image: ShardImage) -> Members:
-    """What is to be had of the image's files: colour and depth as they are, masks as run lengths."""
+    """What there is of the image's files: colour and depth as they are, masks as run lengths."""
     scene, members = image.scene, {}
     for extension in ("png", "jpg"):
         if (path := scene.rgb(image.im_id, extension)).exists():

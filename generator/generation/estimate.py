@@ -81,7 +81,7 @@ def estimate(recipe: Recipe, out: Path, execution: Execution) -> Estimate:
     check_photos(sources)
     dataset = DatasetStore(out, recipe)
     if (out / DATASET_FILE).exists():
-        dataset = DatasetStore.open(out, recipe, sources.models, sources.scenery_digest)
+        dataset = DatasetStore.begun(out, recipe, sources.models, sources.scenery_digest)
     done, missing = dataset.done(), wanted(dataset, execution.part)
     views = recipe.camera.views_per_drop
     drops = {plan_image(number, views).drop for number in missing}

@@ -238,12 +238,11 @@ class _LocalPool:
         try:
             with _without_interrupts(), console_to(log):
                 process.start()
+                self._workers.append(worker)
         except OSError as error:  # no memory, or no process, is left for it
             ours.close()
             time.sleep(_TICK_S)
-            self._died_at_start(f"cannot be started: {error.strerror}", worker)
-        else:
-            self._workers.append(worker)
+            self._died_at_start(f"the error {error.strerror}", worker)
         finally:
             theirs.close()  # so that its end is the pipe's end
 

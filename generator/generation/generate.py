@@ -24,7 +24,7 @@ from synthetless.generation.devices import CPU, Devices
 from synthetless.generation.drop import DropRenderer
 from synthetless.generation.executors import DropResult, DropTask, WorkerConfig
 from synthetless.generation.sources import Sources, check_photos, load_sources
-from synthetless.io.files import in_turn, locked, write_json
+from synthetless.io.files import in_turn, locked, remove_file, write_json
 from synthetless.io.parallel import usable_cores
 from synthetless.scenes.sampling import sample_scene
 
@@ -148,7 +148,7 @@ def retry(out: Path, drop: int, textures: str | None = None) -> int:
             raise UserError(f"{out}: has no drop {drop}; its {images} images show the drops from 0 on")
         for image in DropRenderer(recipe, sources).make(drop, plans):
             dataset.commit(image)
-        (out / FAILURES_FOLDER / f"{drop:08d}.json").unlink(missing_ok=True)
+        remove_file(_failure_note(out, drop))
         dataset.finish()
     return len(plans)
 
@@ -196,12 +196,16 @@ def _draw_sheet(dataset: DatasetStore) -> None:
 def _note_failure(dataset: DatasetStore, sources: Sources, result: DropResult) -> None:
     """Leave a note of a failed drop with the scene that it began with; take away that of one that went well."""
     drop, recipe = result.task.drop, dataset.recipe
-    path = dataset.root / FAILURES_FOLDER / f"{drop:08d}.json"
+    path = _failure_note(dataset.root, drop)
     if result.failure:
         scene = sample_scene(recipe, sources.catalogue, recipe.seed, drop)
         write_json(path, {"drop": drop, "failure": result.failure, "scene": asdict(scene)})
     else:
-        path.unlink(missing_ok=True)
+        remove_file(path)
+
+
+def _failure_note(root: Path, drop: int) -> Path:
+    return root / FAILURES_FOLDER / f"{drop:08d}.json"
 
 
 def _summarise(dataset: DatasetStore, made: int, failures: list[DropResult]) -> Summary:

@@ -1,19 +1,13 @@
-"""From the renderer's linear light to the 8-bit image that is stored."""
+"""From the renderer's linear light to the 8-bit image that is stored, and how bright that is."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)  # Rec. 709
+from synthetless.scenes.srgb import LUMINANCE_WEIGHTS, linear_from_srgb, srgb_from_linear
+
 _GAIN_STEPS = 24
-
-
-def srgb(linear: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Displayed value of linear light, both clipped to 0..1 (IEC 61966-2-1)."""
-    value = np.clip(linear, 0.0, 1.0)
-    displayed: NDArray[np.float32] = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
-    return displayed
 
 
 def exposure_gain(linear: NDArray[np.float32], bounds: tuple[float, float]) -> float:
@@ -26,15 +20,15 @@ def exposure_gain(linear: NDArray[np.float32], bounds: tuple[float, float]) -> f
     Returns:
         1 where the image is within bounds as it is, or where it is black.
     """
-    luminance = np.maximum(linear @ _LUMINANCE, 0.0)
-    mean = float(srgb(luminance).mean())
+    luminance = np.maximum(linear @ LUMINANCE_WEIGHTS, 0.0)
+    mean = float(srgb_from_linear(luminance).mean())
     target = min(max(mean, bounds[0]), bounds[1])
     if mean in (target, 0.0):
         return 1.0
     low, high = (-20.0, 0.0) if mean > target else (0.0, 20.0)  # in stops; the mean rises with the gain
     for _ in range(_GAIN_STEPS):
         middle = (low + high) / 2
-        if float(srgb(luminance * np.float32(2.0**middle)).mean()) < target:
+        if float(srgb_from_linear(luminance * np.float32(2.0**middle)).mean()) < target:
             low = middle
         else:
             high = middle
@@ -43,5 +37,11 @@ def exposure_gain(linear: NDArray[np.float32], bounds: tuple[float, float]) -> f
 
 def tonemap(linear: NDArray[np.float32], gain: float) -> NDArray[np.uint8]:
     """(H, W, 3) linear light, times a gain, as 8-bit sRGB."""
-    displayed: NDArray[np.uint8] = np.rint(srgb(linear * np.float32(gain)) * 255).astype(np.uint8)
+    displayed: NDArray[np.uint8] = np.rint(srgb_from_linear(linear * np.float32(gain)) * 255).astype(np.uint8)
     return displayed
+
+
+def mean_luminance(rgb: NDArray[np.uint8]) -> float:
+    """Mean displayed luminance, 0..1, of an (H, W, 3) sRGB image: what a recipe's render.exposure bounds."""
+    linear = np.array([linear_from_srgb(level / 255) for level in range(256)], dtype=np.float32)
+    return float(srgb_from_linear(linear[rgb] @ LUMINANCE_WEIGHTS).mean())

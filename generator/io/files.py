@@ -6,6 +6,7 @@ import errno
 import fcntl
 import json
 import os
+import re
 import shutil
 import socket
 import stat
@@ -15,6 +16,8 @@ from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 from typing import Any, BinaryIO
+
+import psutil
 
 from synthetless.errors import UserError
 
@@ -31,7 +34,7 @@ def atomic_file(path: Path, durable: bool = False) -> Iterator[BinaryIO]:
     Raises:
         UserError: the file cannot be written.
     """
-    draft = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.part")
+    draft = _draft(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with draft.open("wb") as file:
@@ -69,25 +72,73 @@ def replace_file(source: Path, target: Path) -> None:
 
 
 @contextmanager
-def atomic_folder(path: Path) -> Iterator[Path]:
+def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
     """A folder to fill, which becomes ``path`` when the block ends well and vanishes otherwise.
 
+    Where several processes fill the same folder, the first to end has it, and the others fail.
+
+    Args:
+        path: where the folder is to be; missing parent folders are made.
+        replace: take the place of a folder that is there, with everything in it.
+
     Raises:
-        UserError: ``path`` is a file or a folder that holds something, or cannot be written.
+        UserError: ``path`` is a file, or a folder that holds something and is not to be replaced, or cannot be written.
     """
     path = path.resolve()
-    draft = path.with_name(f".{path.name}.part")
+    draft = _draft(path)
     try:
-        if path.is_file() or (path.is_dir() and any(path.iterdir())):
+        if path.is_file() or (not replace and path.is_dir() and any(path.iterdir())):
             raise UserError(f"{path}: exists already; give a new or an empty folder")
-        shutil.rmtree(draft, ignore_errors=True)
+        remove_drafts(path.parent, path.name)
         draft.mkdir(parents=True)
         yield draft
-        draft.replace(path)
+        if replace and path.exists():
+            former = draft.with_suffix(".former.part")
+            path.replace(former)
+            draft.replace(path)
+            shutil.rmtree(former, ignore_errors=True)
+        else:
+            draft.replace(path)
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror or error})") from error
     finally:
         shutil.rmtree(draft, ignore_errors=True)
+
+
+def remove_file(path: Path) -> None:
+    """Remove a file, if it is there.
+
+    Raises:
+        UserError: it cannot be removed.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be removed ({error.strerror})") from None
+
+
+def remove_drafts(folder: Path, name: str | None = None) -> None:
+    """Remove what processes of this machine left in a folder when they were killed while they wrote to it.
+
+    Args:
+        folder: where the files or folders were to be; need not exist.
+        name: of the one that was being written; None for any.
+    """
+    host = re.escape(socket.gethostname())
+    pattern = re.compile(rf"\.{'.+' if name is None else re.escape(name)}\.{host}\.(\d+)(\.former)?\.part")
+    for left in sorted(folder.iterdir()) if folder.is_dir() else ():
+        match = pattern.fullmatch(left.name)
+        if match is None or psutil.pid_exists(int(match[1])):
+            continue
+        if left.is_dir() and not left.is_symlink():
+            shutil.rmtree(left, ignore_errors=True)
+        else:
+            left.unlink(missing_ok=True)
+
+
+def _draft(path: Path) -> Path:
+    """What is being written, beside its place: a name of this process, so that others write theirs."""
+    return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.part")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -10,20 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from synthetless.errors import UserError
 from synthetless.io.documents import shown
 from synthetless.io.files import read_json
+from synthetless.io.meshes import SUFFIXES, TriangleMesh, read_mesh
 
 INFO_FILE = "models_info.json"
 _PLY_NAME = re.compile(r"obj_(\d{6})\.ply")
+_ID = re.compile(r"(?:obj(?:ect)?[ _-]?)?0*(\d+)", re.IGNORECASE)
 _REPORTED_BOX_TOLERANCE_MM = 0.5
-
-
-class ModelError(UserError):
-    """A models folder, a mesh or models_info.json that cannot be used; the message is one line."""
+_LARGEST_MM = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +31,10 @@ class ObjectModel:
     Attributes:
         obj_id: BOP object id.
         path: the PLY file.
-        vertices_mm: (V, 3) float64.
+        vertices_mm: (V, 3) float64, each used by a face.
         faces: (F, 3) int32.
         info: the object's entry in models_info.json: diameter, box and symmetries.
+        is_verbatim: whether the file holds exactly these vertices and triangles.
     """
 
     obj_id: int
@@ -43,6 +42,7 @@ class ObjectModel:
     vertices_mm: NDArray[np.float64]
     faces: NDArray[np.int32]
     info: Mapping[str, Any]
+    is_verbatim: bool = True
 
     @property
     def diameter_mm(self) -> float:
@@ -58,8 +58,52 @@ class ObjectModel:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the PLY file."""
-        return hashlib.sha256(self.path.read_bytes()).hexdigest()
+        """SHA-256 of the PLY file that a dataset carries."""
+        return hashlib.sha256(self.to_ply()).hexdigest()
+
+    def to_ply(self) -> bytes:
+        """The PLY file that a dataset carries: the model's own where that is this mesh, else one written of it."""
+        if self.is_verbatim:
+            return self.path.read_bytes()
+        return TriangleMesh(self.vertices_mm, self.faces.astype(np.int64), self.is_verbatim).to_ply()
+
+
+@dataclass(frozen=True)
+class MeshFiles:
+    """The meshes of a folder.
+
+    Attributes:
+        paths: by object id.
+        are_numbered: whether the ids are only the files' places in alphabetical order, as not all names say one.
+    """
+
+    paths: Mapping[int, Path]
+    are_numbered: bool
+
+
+def find_meshes(folder: Path) -> MeshFiles:
+    """The PLY, STL, OBJ and OFF files of any folder.
+
+    Ids come from the names (`obj_000012.ply`, `12.stl`) if all of them say one, else from alphabetical order.
+
+    Raises:
+        UserError: no such folder, no mesh in it, or two of one id.
+    """
+    if not folder.is_dir():
+        raise UserError(f"{folder}: no such folder; give one that holds meshes ({', '.join(SUFFIXES)})")
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+    if not files:
+        raise UserError(f"{folder}: holds no meshes; files that end in {', '.join(SUFFIXES)} are looked for")
+    matches = [_ID.fullmatch(path.stem) for path in files]
+    if not all(matches):
+        return MeshFiles(dict(enumerate(files, start=1)), are_numbered=True)
+    paths: dict[int, Path] = {}
+    for path, match in zip(files, matches, strict=True):
+        obj_id = int(match[1]) if match else 0
+        if obj_id in paths:
+            raise UserError(f"{folder}: {paths[obj_id].name} and {path.name} are both object {obj_id}; remove one")
+        paths[obj_id] = path
+    return MeshFiles(dict(sorted(paths.items())), are_numbered=False)
 
 
 def load_models(folder: Path, obj_ids: tuple[int, ...] | None = None) -> dict[int, ObjectModel]:
@@ -73,7 +117,7 @@ def load_models(folder: Path, obj_ids: tuple[int, ...] | None = None) -> dict[in
         Models by id, in ascending order.
 
     Raises:
-        ModelError: the folder, a mesh or models_info.json is missing or unusable.
+        UserError: the folder, a mesh or models_info.json is missing or unusable.
     """
     files = _find_meshes(folder)
     info = read_models_info(folder)
@@ -81,9 +125,9 @@ def load_models(folder: Path, obj_ids: tuple[int, ...] | None = None) -> dict[in
     for obj_id in wanted:
         if obj_id not in files:
             known = ", ".join(str(i) for i in sorted(files))
-            raise ModelError(f"{folder}: no mesh for object {obj_id}; the folder holds objects {known}")
+            raise UserError(f"{folder}: no mesh for object {obj_id}; the folder holds objects {known}")
         if obj_id not in info:
-            raise ModelError(
+            raise UserError(
                 f"{folder / INFO_FILE}: no entry for object {obj_id} ({files[obj_id].name}); "
                 "add its diameter, box and symmetries, or leave it out with objects.ids"
             )
@@ -94,77 +138,62 @@ def read_models_info(folder: Path) -> dict[int, dict[str, Any]]:
     """models_info.json by object id.
 
     Raises:
-        ModelError: it is missing, not JSON, names a key twice, or is not a mapping of ids to entries.
+        UserError: it is missing, not JSON, names a key twice, or is not a mapping of ids to entries.
     """
     path = folder / INFO_FILE
     if not path.exists():
-        raise ModelError(f"{path}: not found; a BOP models folder needs it")
-    try:
-        content = read_json(path)
-    except UserError as error:
-        raise ModelError(str(error)) from None
+        raise UserError(f"{path}: not found; a BOP models folder needs it")
+    content = read_json(path)
     entries: dict[int, dict[str, Any]] = {}
     for key, entry in content.items():
         if not (key.strip().isascii() and key.strip().isdecimal()):
-            raise ModelError(f'{path}: the key {shown(key)} is not an object id, such as "1"')
+            raise UserError(f'{path}: the key {shown(key)} is not an object id, such as "1"')
         if not isinstance(entry, dict):
-            raise ModelError(f"{path}: object {key} is {shown(entry)}, not a mapping of diameter, box and symmetries")
+            raise UserError(f"{path}: object {key} is {shown(entry)}, not a mapping of diameter, box and symmetries")
         if int(key) in entries:
-            raise ModelError(f"{path}: object {int(key)} is listed twice, once as {shown(key)}")
+            raise UserError(f"{path}: object {int(key)} is listed twice, once as {shown(key)}")
         entries[int(key)] = entry
     return entries
 
 
 def _find_meshes(folder: Path) -> dict[int, Path]:
     if not folder.is_dir():
-        raise ModelError(f"{folder}: no such models folder; give one that holds obj_000001.ply, ...")
+        raise UserError(f"{folder}: no such models folder; give one that holds obj_000001.ply, ...")
     files = {
         int(match.group(1)): path for path in sorted(folder.iterdir()) if (match := _PLY_NAME.fullmatch(path.name))
     }
     if not files:
-        raise ModelError(f"{folder}: holds no models; expected files named obj_000001.ply, ...")
+        raise UserError(f"{folder}: holds no models; expected files named obj_000001.ply, ...")
     return files
 
 
 def _load_model(obj_id: int, path: Path, info: Mapping[str, Any]) -> ObjectModel:
-    vertices, faces = _read_mesh(path)
-    diameter = info.get("diameter")
-    if not isinstance(diameter, int | float) or not np.isfinite(diameter) or diameter <= 0:
-        raise ModelError(
-            f"{path.parent / INFO_FILE}: object {obj_id} has diameter {diameter!r}; a positive number of mm is needed"
-        )
-    _check_box(path, vertices, info)
-    return ObjectModel(obj_id, path, vertices, faces, info)
+    mesh = read_mesh(path)
+    if _length_mm(path, obj_id, info, "diameter") == 0:
+        raise UserError(f"{path.parent / INFO_FILE}: object {obj_id} has diameter 0; a positive number of mm is needed")
+    _check_box(path, obj_id, mesh.vertices_mm, info)
+    return ObjectModel(obj_id, path, mesh.vertices_mm, mesh.faces.astype(np.int32), info, mesh.is_verbatim)
 
 
-def _read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    try:
-        mesh = trimesh.load(path, process=False)
-    except Exception as error:  # trimesh raises whatever its parser stumbles over
-        raise ModelError(f"{path}: not a readable PLY file ({_first_line(error)})") from None
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise ModelError(f"{path}: holds no faces; a triangle mesh is needed")
-    faces = np.asarray(mesh.faces)
-    vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
-    if not np.isfinite(vertices).all():
-        bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
-        raise ModelError(f"{path}: vertex {bad} is {vertices[bad].tolist()}; every coordinate must be finite")
-    if np.min(faces) < 0 or np.max(faces) >= len(vertices):
-        raise ModelError(f"{path}: a face names vertex {int(np.max(faces))}, but there are only {len(vertices)}")
-    return vertices, np.ascontiguousarray(faces, dtype=np.int32)
-
-
-def _check_box(path: Path, vertices_mm: NDArray[np.float64], info: Mapping[str, Any]) -> None:
+def _check_box(path: Path, obj_id: int, vertices_mm: NDArray[np.float64], info: Mapping[str, Any]) -> None:
     """A box that contradicts the mesh means wrong units or another mesh: every label would be wrong."""
     size = np.ptp(vertices_mm, axis=0)
     for axis, measured in zip("xyz", size, strict=True):
-        stated = info.get(f"size_{axis}")
-        if stated is not None and abs(float(stated) - measured) > _REPORTED_BOX_TOLERANCE_MM + 0.01 * measured:
-            raise ModelError(
-                f"{path}: is {measured:.3f} mm along {axis}, but {INFO_FILE} says {float(stated):.3f}; "
+        if info.get(f"size_{axis}") is None:
+            continue
+        stated = _length_mm(path, obj_id, info, f"size_{axis}")
+        if abs(stated - measured) > _REPORTED_BOX_TOLERANCE_MM + 0.01 * measured:
+            raise UserError(
+                f"{path}: is {measured:.3f} mm along {axis}, but {INFO_FILE} says {stated:.3f}; "
                 "are its units millimetres, and is it the right mesh?"
             )
 
 
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+def _length_mm(path: Path, obj_id: int, info: Mapping[str, Any], key: str) -> float:
+    """A length that models_info.json states."""
+    value = info.get(key)
+    if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < _LARGEST_MM:
+        return value
+    raise UserError(
+        f"{path.parent / INFO_FILE}: object {obj_id} has {key} {shown(value)}; a positive number of mm is needed"
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import get_context
 from typing import Protocol, TypeVar
@@ -51,13 +52,16 @@ def processes(wanted: int | None, most: int) -> Iterator[Map]:
         def map_in_pool(
             function: Callable[[Task], Result], tasks: Sequence[Task], chunksize: int = 1
         ) -> Iterator[Result]:
-            return iter(pool.map(function, tasks, chunksize=chunksize).result())
+            try:
+                return iter(pool.map(function, tasks, chunksize=chunksize).result())
+            except RuntimeError:  # all that pebble says of a pool whose processes have died
+                raise BrokenProcessPool from None
 
         try:
             yield map_in_pool
         except BaseException as error:
             pool.stop()  # or whoever pressed Ctrl-C would wait for the tasks that are under way
-            if isinstance(error, ProcessExpired):
+            if isinstance(error, ProcessExpired | BrokenProcessPool):
                 told = "a worker process was killed, perhaps for lack of memory; run it again"
                 raise ChildProcessError(told) from None
             raise

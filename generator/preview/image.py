@@ -1,24 +1,42 @@
-"""One image for the pages: its small pictures, and everything that can be drawn into them or told beside them."""
+"""One image for the pages: its small pictures, and everything that can be drawn into them or told beside them.
+
+What is drawn is data, as outlines and lines in pixels of the image; pixel (i, j) has its centre at (u, v) = (i, j).
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetless.dataset.labels import box_corners_mm
-from synthetless.dataset.layout import ScenePaths
-from synthetless.dataset.reader import ImageEntries
-from synthetless.dataset.records import Entry, GtInfoEntry, ImageSpec
-from synthetless.io.files import atomic_write
-from synthetless.preview import overlays, parameters, pictures
+from synthetless.dataset.labels import BOX_EDGES, box_corners_mm
+from synthetless.dataset.layout import CAMERA_FILE
+from synthetless.dataset.reader import Image, Instance, Visibility
+from synthetless.dataset.records import ImageSpec, ModelInfo
+from synthetless.errors import UserError
+from synthetless.io import images
+from synthetless.io.files import atomic_write, read_bytes
+from synthetless.scenes.spec import Material, PlaneSpec, Vector, View
+from synthetless.scenes.srgb import srgb_from_linear
+from synthetless.scenes.textures import PhotoTexture
+
+Floats = NDArray[np.float64]
+Pixels = NDArray[np.uint8]
+Segment = list[float]
+"""A line in the image: [u, v, u', v']."""
+Section = dict[str, Any]
 
 _GREY = np.uint8(128)
+_LARGEST_PX, _THUMBNAIL_PX = 1280, 256
+_QUALITY = 90
+_NEAR_MM = 10.0
+_TOLERANCE_PX = 0.6
 
 
 @dataclass(frozen=True)
@@ -26,25 +44,23 @@ class ImageTask:
     """An image on its way to a worker process.
 
     Attributes:
-        scene: the files of its scene folder.
-        labels: what the scene's JSON files say of it.
+        image: what the dataset says of it; every instance has a label and visibility.
         recorded: how it was made, if that was recorded.
         infos: models_info.json.
-        size_px: width and height.
+        size_px: width and height, if camera.json says them; used where there is no picture.
         to: the folder of the pages.
     """
 
-    scene: ScenePaths
-    labels: ImageEntries
+    image: Image
     recorded: ImageSpec | None
-    infos: Mapping[int, Entry]
-    size_px: tuple[int, int]
+    infos: Mapping[int, ModelInfo]
+    size_px: tuple[int, int] | None
     to: Path
 
     @property
     def key(self) -> str:
         """What the image is called: SCENE/IMAGE."""
-        return f"{self.scene.root.name}/{self.labels.im_id:06d}"
+        return f"{self.image.paths.root.name}/{self.image.im_id:06d}"
 
 
 def write_image(task: ImageTask) -> str:
@@ -53,67 +69,244 @@ def write_image(task: ImageTask) -> str:
     Raises:
         UserError: a file of the dataset is damaged, or one of the pages cannot be written.
     """
-    views, depth_mm = _views(task)
+    depth, depth_mm = _depth_view(task.image)
+    found = {"rgb": _rgb_view(task.image), "depth": depth, "normals": _normals_view(task.image)}
+    views = {name: pixels for name, pixels in found.items() if pixels is not None}
     shown = {name: f"images/{task.key}-{name}.jpg" for name in views}
     for name, pixels in views.items():
-        atomic_write(task.to / shown[name], pictures.encode(pixels))
-    thumbnail = next(iter(views.values()), np.full((*task.size_px[::-1], 3), _GREY))
-    atomic_write(task.to / f"thumbnails/{task.key}.jpg", pictures.encode(thumbnail, pictures.THUMBNAIL_PX))
-    content = json.dumps(detail(task) | {"views": shown, "depth_mm": depth_mm}, allow_nan=False)
-    atomic_write(task.to / f"data/{task.key}.js", f"synthetless.arrived({json.dumps(task.key)}, {content});\n".encode())
+        atomic_write(task.to / shown[name], _encode(pixels, _LARGEST_PX))
+    best = next(iter(views.values()), None)
+    width, height = _size_px(task) if best is None else best.shape[1::-1]
+    thumbnail = np.full((height, width, 3), _GREY) if best is None else best
+    atomic_write(task.to / f"thumbnails/{task.key}.jpg", _encode(thumbnail, _THUMBNAIL_PX))
+    content = {
+        "size": [width, height],
+        "sections": _sections(task.image.K, task.recorded),
+        "instances": [_instance(task, instance) for instance in task.image.instances],
+        "views": shown,
+        "depth_mm": depth_mm,
+    }
+    script = f"synthetless.arrived({json.dumps(task.key)}, {json.dumps(content, allow_nan=False)});\n"
+    atomic_write(task.to / f"data/{task.key}.js", script.encode())
     return task.key
 
 
-def detail(task: ImageTask) -> dict[str, Any]:
-    """What the page of one image draws and tells; strings in it are data, never markup."""
-    gts = range(len(task.labels.gt))
+def _size_px(task: ImageTask) -> tuple[int, int]:
+    if task.size_px is None:
+        raise UserError(
+            f"{task.image.paths.root}: image {task.image.im_id} has no picture, and {CAMERA_FILE} does not say its size"
+        )
+    return task.size_px
+
+
+def _instance(task: ImageTask, instance: Instance) -> dict[str, Any]:
+    label, seen, model = instance.label, instance.visibility, task.infos[instance.obj_id]
+    assert label is not None and seen is not None  # see ImageTask
+    paths, K = task.image.paths, task.image.K
+    masks = {"visible": paths.mask_visib, "amodal": paths.mask}
+    existing = {name: path for name, of in masks.items() if (path := of(instance.im_id, instance.gt_id)).exists()}
     return {
-        "size": list(task.size_px),
-        "sections": parameters.sections(task.labels.camera, task.recorded),
-        "instances": [_instance(task, gt_id) for gt_id in gts],
+        "gt": instance.gt_id,
+        "obj": instance.obj_id,
+        "visib": round(seen.visib_fract, 4),
+        "regressor": label.regressor_index,
+        "regressors": label.n_regressors,
+        "margin": round(label.discontinuity_margin_deg, 2),
+        "distance": round(float(np.linalg.norm(instance.t_m2c)), 1),
+        "place": _place(seen),
+        "material": _material(task.recorded, instance.gt_id),
+        "outlines": {name: outline(images.decode_mask(read_bytes(path), path)) for name, path in existing.items()},
+        "true": _pose(K, instance.R_m2c, instance.t_m2c, model),
+        "canonical": _pose(K, label.R_m2c, label.t_m2c, model),
     }
 
 
-def _views(task: ImageTask) -> tuple[dict[str, NDArray[np.uint8]], list[float]]:
-    """The pictures that there are of an image, the best one first, and the range that the depth picture shows."""
-    im_id = task.labels.im_id
-    depth, range_mm = pictures.depth(task.scene, im_id, float(task.labels.camera.get("depth_scale", 1.0)))
-    views = {"rgb": pictures.rgb(task.scene, im_id), "depth": depth, "normals": pictures.normals(task.scene, im_id)}
-    return {name: pixels for name, pixels in views.items() if pixels is not None}, range_mm
-
-
-def _instance(task: ImageTask, gt_id: int) -> dict[str, Any]:
-    labels, im_id = task.labels, task.labels.im_id
-    gt, info, canonical = labels.gt[gt_id], labels.gt_info[gt_id], labels.gt_canonical[gt_id]
-    model = task.infos[gt["obj_id"]]
-    K = np.array(labels.camera["cam_K"], dtype=np.float64).reshape(3, 3)
-    masks = {"visible": task.scene.mask_visib(im_id, gt_id), "amodal": task.scene.mask(im_id, gt_id)}
-    outlines = {name: pictures.mask(path) for name, path in masks.items()}
+def _pose(K: Floats, R_m2c: Floats, t_m2c: Floats, model: ModelInfo) -> dict[str, list[Segment]]:
     return {
-        "gt": gt_id,
-        "obj": gt["obj_id"],
-        "visib": round(info["visib_fract"], 4),
-        "regressor": canonical["regressor_index"],
-        "regressors": canonical["n_regressors"],
-        "margin": round(canonical["discontinuity_margin_deg"], 2),
-        "distance": round(float(np.linalg.norm(gt["cam_t_m2c"])), 1),
-        "place": _place(info),
-        "material": parameters.material(task.recorded, gt_id),
-        "outlines": {name: overlays.outline(mask) for name, mask in outlines.items() if mask is not None},
-        "true": _pose(K, gt["cam_R_m2c"], gt["cam_t_m2c"], model),
-        "canonical": _pose(K, canonical["cam_R_m2c_canonical"], canonical["cam_t_m2c_canonical"], model),
+        "box": box_lines(K, R_m2c, t_m2c, box_corners_mm(model)),
+        "axes": axis_lines(K, R_m2c, t_m2c, 0.5 * float(model["diameter"])),
     }
 
 
-def _pose(K: NDArray[np.float64], rotation: list[float], translation: list[float], model: Entry) -> dict[str, Any]:
-    R, t = np.array(rotation, dtype=np.float64).reshape(3, 3), np.array(translation, dtype=np.float64)
-    return {
-        "box": overlays.box_lines(K, R, t, box_corners_mm(model)),
-        "axes": overlays.axis_lines(K, R, t, 0.5 * float(model["diameter"])),
-    }
-
-
-def _place(info: GtInfoEntry) -> list[float]:
+def _place(seen: Visibility) -> list[float]:
     """Where an instance's words are written: the middle of its visible box; nowhere if it is hidden."""
-    x, y, w, h = info["bbox_visib"]
+    x, y, w, h = seen.bbox_visib
     return [] if w < 0 else [x + w / 2, y + h / 2]
+
+
+# Pictures
+
+
+def _rgb_view(image: Image) -> Pixels | None:
+    return image.rgb() if image.paths.find_rgb(image.im_id) else None
+
+
+def _depth_view(image: Image) -> tuple[Pixels | None, list[float]]:
+    """Depth as colours, near ones bright, black where there is none; and its range [near, far] in mm.
+
+    The farthest fiftieth of the pixels, often a table's horizon, has one colour.
+    """
+    if not image.paths.depth(image.im_id).exists():
+        return None, []
+    depth_mm = image.depth_mm()
+    present = depth_mm > 0
+    if not present.any():
+        return np.zeros((*depth_mm.shape, 3), np.uint8), []
+    near, far = np.percentile(depth_mm[present], [0.0, 98.0]).tolist()
+    level = np.clip((far - depth_mm) / max(far - near, 1e-6), 0, 1)
+    colours = cv2.applyColorMap(np.rint(255 * level).astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]
+    return np.where(present[..., None], colours, 0).astype(np.uint8), [round(near, 1), round(far, 1)]
+
+
+def _normals_view(image: Image) -> Pixels | None:
+    """Unit normals as colours: x red, y green, z blue, each 0 at -1 and 255 at 1; black where there is none."""
+    if not image.paths.normals(image.im_id).exists():
+        return None
+    vectors = image.normals()
+    colours = np.where(vectors.any(axis=2)[..., None], 127.5 + 127.5 * vectors, 0)
+    pixels: Pixels = np.rint(colours).astype(np.uint8)
+    return pixels
+
+
+def _encode(pixels: Pixels, largest_px: int) -> bytes:
+    """A JPEG of which no side is longer than ``largest_px``."""
+    height, width = pixels.shape[:2]
+    scale = min(1.0, largest_px / max(height, width))
+    if scale < 1:
+        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    return images.encode_jpeg(np.ascontiguousarray(pixels), _QUALITY)
+
+
+# Labels as lines
+
+
+def outline(mask: NDArray[np.bool_]) -> str:
+    """The border of a mask as an SVG path, holes included (fill-rule evenodd); "" for an empty mask.
+
+    It runs through the centres of the border pixels, simplified by at most 0.6 pixels.
+    """
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    return "".join(_closed(cv2.approxPolyDP(contour, _TOLERANCE_PX, True).reshape(-1, 2)) for contour in contours)
+
+
+def _closed(points: NDArray[Any]) -> str:
+    return "M" + "L".join(f"{u} {v}" for u, v in points.tolist()) + "Z"
+
+
+def box_lines(K: Floats, R_m2c: Floats, t_m2c: Floats, corners_mm: Floats) -> list[Segment]:
+    """The twelve edges of a box in the image; parts behind the camera are cut off.
+
+    Args:
+        K: (3, 3) camera matrix, pixels.
+        R_m2c, t_m2c: pose, (3, 3) and (3,) mm.
+        corners_mm: (8, 3), in the order of ``labels.box_corners_mm``.
+
+    Returns:
+        [u, v, u', v'] of each edge that is at least partly before the camera.
+    """
+    return _lines(K, corners_mm @ R_m2c.T + t_m2c, BOX_EDGES)
+
+
+def axis_lines(K: Floats, R_m2c: Floats, t_m2c: Floats, length_mm: float) -> list[Segment]:
+    """The model frame's x, y and z axis in the image, each from the origin, as ``box_lines``.
+
+    The list is empty unless the origin and all three ends are before the camera: an axis has its colour by its place.
+    """
+    ends = np.vstack([np.zeros(3), length_mm * np.eye(3)]) @ R_m2c.T + t_m2c
+    return _lines(K, ends, ((0, 1), (0, 2), (0, 3))) if (ends[:, 2] > _NEAR_MM).all() else []
+
+
+def _lines(K: Floats, points_mm: Floats, pairs: Sequence[tuple[int, int]]) -> list[Segment]:
+    clipped = (_before_camera(points_mm[a], points_mm[b]) for a, b in pairs)
+    return [_projected(K, ends) for ends in clipped if ends is not None]
+
+
+def _before_camera(a: Floats, b: Floats) -> Floats | None:
+    """The part (2, 3) of a segment that is farther than the near plane."""
+    if max(a[2], b[2]) <= _NEAR_MM:
+        return None
+    if min(a[2], b[2]) <= _NEAR_MM:
+        cut = a + (b - a) * ((_NEAR_MM - a[2]) / (b[2] - a[2]))
+        a, b = (cut, b) if a[2] <= _NEAR_MM else (a, cut)
+    return np.stack([a, b])
+
+
+def _projected(K: Floats, ends_mm: Floats) -> Segment:
+    pixels: Segment = np.round((ends_mm @ K.T)[:, :2] / ends_mm[:, 2:], 1).ravel().tolist()
+    return pixels
+
+
+# The recorded scene in words
+
+
+def _sections(K: Floats, recorded: ImageSpec | None) -> list[Section]:
+    """What was drawn for an image: {"title", "rows"}, a row being [name, value] or [name, value, CSS colour]."""
+    pinhole = [
+        ["focal lengths", f"{K[0, 0]:.2f}, {K[1, 1]:.2f} px"],
+        ["principal point", f"{K[0, 2]:.2f}, {K[1, 2]:.2f} px"],
+    ]
+    if recorded is None:
+        return [{"title": "Camera", "rows": pinhole}]
+    spec = recorded.scene
+    return [
+        {"title": "Camera", "rows": _view_rows(spec.views[recorded.view]) + pinhole},
+        {
+            "title": "Light",
+            "rows": [
+                ["lamp strength", f"{spec.light.strength:.2f}"],
+                ["lamp colour", _hex(spec.light.color), _hex(spec.light.color)],
+                ["lamp azimuth", f"{spec.light.azimuth_deg:.1f}°"],
+                ["lamp elevation", f"{spec.light.elevation_deg:.1f}°"],
+                ["lamp distance", f"{spec.light.distance_m:.2f} m"],
+                ["lamp radius", f"{1000 * spec.light.radius_m:.0f} mm"],
+                ["ambient level", f"{spec.ambient.level:.2f}"],
+                ["exposure gain", f"{recorded.exposure_gain:.2f}"],
+            ],
+        },
+        {"title": "Table", "rows": _plane_rows(spec.plane)},
+        {
+            "title": "Drop",
+            "rows": [
+                ["drop", str(spec.drop)],
+                ["throw", str(spec.attempt + 1)],
+                ["view", f"{recorded.view + 1} of {len(spec.views)}"],
+                ["objects dropped", str(len(spec.objects))],
+            ],
+        },
+    ]
+
+
+def _view_rows(view: View) -> list[list[str]]:
+    return [
+        ["distance", f"{view.distance_m:.3f} m"],
+        ["elevation", f"{view.elevation_deg:.1f}°"],
+        ["azimuth", f"{view.azimuth_deg:.1f}°"],
+        ["roll", f"{view.roll_deg:.1f}°"],
+    ]
+
+
+def _plane_rows(plane: PlaneSpec) -> list[list[str]]:
+    texture = plane.texture
+    words = texture.file if isinstance(texture, PhotoTexture) else f"{texture.family}, seed {texture.seed}"
+    return [
+        ["texture", words],
+        ["tile", f"{plane.tile_m:.2f} m, turned {plane.rotation_deg:.0f}°"],
+        ["roughness", f"{plane.roughness:.2f}"],
+        ["specular", f"{plane.specular:.2f}"],
+    ]
+
+
+def _material(recorded: ImageSpec | None, gt_id: int) -> list[str]:
+    """[words, CSS colour] of a labelled instance's material; nothing if it was not recorded."""
+    if recorded is None:
+        return []
+    made_of: Material = recorded.scene.objects[recorded.instances[gt_id]].material
+    colour = _hex(made_of.albedo)
+    return [f"{colour}, roughness {made_of.roughness:.2f}, specular {made_of.specular:.2f}", colour]
+
+
+def _hex(linear: Vector) -> str:
+    displayed = srgb_from_linear(np.array(linear, dtype=np.float32))
+    red, green, blue = np.rint(255 * displayed).astype(int).tolist()
+    return f"#{red:02x}{green:02x}{blue:02x}"

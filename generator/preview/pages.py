@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Mapping
 from importlib.resources import as_file, files
@@ -12,23 +13,42 @@ from typing import Any
 
 from synthetless.dataset.sheet import class_color
 from synthetless.errors import UserError
-from synthetless.io.files import atomic_write
+from synthetless.io.files import atomic_write, read_bytes
+from synthetless.preview.plots import plots
 from synthetless.preview.statistics import Statistics
-from synthetless.preview.statistics.plots import plots
 
-PAGE_FILE, STATISTICS_FILE = "index.html", "statistics.json"
+PAGE_FILE, STATISTICS_PAGE, STATISTICS_FILE = "index.html", "statistics.html", "statistics.json"
 STATIC_FILES = ("preview.css", "gallery.js", "viewer.js")
+_FILES = {PAGE_FILE, STATISTICS_FILE, STATISTICS_PAGE, "data/index.js", *STATIC_FILES}
+_DATA_FILE = re.compile(
+    r"(data/\d{6,}/\d{6,}\.js|thumbnails/\d{6,}/\d{6,}\.jpg|plots/\w+\.svg"
+    r"|images/\d{6,}/\d{6,}-(rgb|depth|normals)\.jpg)"
+)
 _GROUPS = ("labels", "objects", "camera", "light", "table", "image")
 _PACKAGE = "synthetless.preview"
 _MARK = '<meta name="generator" content="synthetless preview">'
 
 
-def is_ours(folder: Path) -> bool:
-    """Whether a folder is empty or a preview, which a new one may replace."""
+def refuse_others(folder: Path) -> None:
+    """Keep a new preview from replacing anything but a former one.
+
+    Raises:
+        UserError: the folder is there, and it is a file or holds something that no preview writes.
+    """
+    if not folder.exists():
+        return
     page = folder / PAGE_FILE
-    if not folder.is_dir():
-        return False
-    return _MARK in page.read_text(encoding="utf-8", errors="replace") if page.is_file() else not any(folder.iterdir())
+    files = [path for path in sorted(folder.rglob("*")) if path.is_symlink() or not path.is_dir()]
+    if not folder.is_dir() or (files and not page.is_file()) or (page.is_file() and _MARK not in _text(page)):
+        raise UserError(f"{folder}: exists already and is no preview; give a new or an empty folder")
+    for path in files:
+        name = path.relative_to(folder).as_posix()
+        if path.is_symlink() or not (name in _FILES or _DATA_FILE.fullmatch(name)):
+            raise UserError(f"{folder}: holds {name}, which no preview writes; move it away, or give another folder")
+
+
+def _text(page: Path) -> str:
+    return read_bytes(page).decode("utf-8", errors="replace")
 
 
 def write_pages(folder: Path, title: str, split: str, images: int) -> None:
@@ -58,7 +78,7 @@ def write_statistics(folder: Path, title: str, of: Statistics, names: Mapping[in
     page = render(
         "statistics.html", title=title, of=of, groups=groups, names=names, recipe=of.drops > 0, colour=_colour
     )
-    atomic_write(folder / "statistics.html", page.encode())
+    atomic_write(folder / STATISTICS_PAGE, page.encode())
 
 
 def _colour(obj_id: int) -> str:

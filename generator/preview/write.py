@@ -1,31 +1,31 @@
-"""Writes the folder of pages: reads a dataset once, scene by scene, its images side by side."""
+"""Writes the folder of pages: reads a dataset scene by scene, and draws its images side by side."""
 
 from __future__ import annotations
 
 import json
-import shutil
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
-from synthetless.dataset import records
-from synthetless.dataset.layout import CAMERA_FILE, DATASET_FILE, ScenePaths, find_split, scene_ids
-from synthetless.dataset.reader import ImageEntries, read_entries, read_specs
-from synthetless.dataset.records import Entry
+from synthetless.dataset.labels import box_corners_mm
+from synthetless.dataset.layout import CAMERA_FILE, PREVIEW_FOLDER, find_models_folder, refuse_target
+from synthetless.dataset.reader import Dataset, Image, Scene, read_specs
+from synthetless.dataset.records import ImageSpec, ModelInfo, read_scene_json
 from synthetless.errors import UserError
 from synthetless.io.files import atomic_folder, atomic_write, read_json
-from synthetless.io.models import INFO_FILE, read_models_info
+from synthetless.io.models import INFO_FILE
 from synthetless.io.parallel import processes
 from synthetless.preview.image import ImageTask, write_image
-from synthetless.preview.pages import PAGE_FILE, is_ours, write_pages, write_statistics
+from synthetless.preview.pages import PAGE_FILE, refuse_others, write_pages, write_statistics
 from synthetless.preview.statistics import statistics
 
-DEFAULT_FOLDER = "preview"
-_MODELS_FOLDERS = ("models", "models_cad", "models_eval")
 _BATCH = 16  # images that a worker takes at a time
+_LARGEST_MM = 1e9  # of a diameter that can be drawn
 _WORTH_A_PROCESS = 64  # images; starting one takes a second or two
 
 
@@ -50,22 +50,19 @@ def write_preview(
         The page to open.
 
     Raises:
-        UserError: there is no such dataset or it is damaged, or ``to`` holds something else or cannot be written.
+        UserError: there is no such dataset or it is damaged; or ``to`` belongs to it, holds something else than a
+            preview, or cannot be written.
     """
-    source = _Source.of(dataset, split or find_split(dataset), limit)
-    to = dataset / DEFAULT_FOLDER if to is None else to
-    if to.exists() and not is_ours(to):
-        raise UserError(f"{to}: exists already and is no preview; give a new or an empty folder")
-    fresh = to.with_name(f".{to.name}.new")
-    shutil.rmtree(fresh, ignore_errors=True)
-    with atomic_folder(fresh) as folder:
+    source = _Source.of(Dataset.open(dataset, split), limit)
+    to = dataset / PREVIEW_FOLDER if to is None else to
+    refuse_target(dataset, to, own=PREVIEW_FOLDER)
+    refuse_others(to)
+    with atomic_folder(to, replace=True) as folder:
         _write_images(source, folder, workers)
-        write_pages(folder, source.title, source.split, source.count)
+        write_pages(folder, source.title, source.dataset.split, source.count)
         names = {obj_id: class_name(obj_id, info) for obj_id, info in source.infos.items()}
-        write_statistics(folder, source.title, statistics(dataset, source.split), names)
-    if to.exists():
-        shutil.rmtree(to)
-    fresh.replace(to)
+        write_statistics(folder, source.title, statistics(dataset, source.dataset.split), names)
+        refuse_others(to)
     return to / PAGE_FILE
 
 
@@ -74,24 +71,23 @@ class _Source:
     """What is to be shown.
 
     Attributes:
-        dataset, split: the folders.
+        dataset: the split.
         images: number of images in each scene folder, by scene id.
         infos: models_info.json.
+        size_px: width and height of the images, if camera.json says them.
         limit: how many images to show at most; None for all.
     """
 
-    dataset: Path
-    split: str
+    dataset: Dataset
     images: Mapping[int, int]
-    infos: Mapping[int, Entry]
+    infos: Mapping[int, ModelInfo]
+    size_px: tuple[int, int] | None
     limit: int | None
 
     @classmethod
-    def of(cls, dataset: Path, split: str, limit: int | None) -> _Source:
-        ids = scene_ids(dataset, split)
-        images = {i: len(records.read_scene_json(ScenePaths.of(dataset, i, split).scene_gt)) for i in ids}
-        folder = next((name for name in _MODELS_FOLDERS if (dataset / name / INFO_FILE).exists()), _MODELS_FOLDERS[0])
-        return cls(dataset, split, images, read_models_info(dataset / folder), limit)
+    def of(cls, dataset: Dataset, limit: int | None) -> _Source:
+        images = {i: len(read_scene_json(dataset.paths(i).scene_gt)) for i in dataset.scene_ids}
+        return cls(dataset, images, dataset.models_info, _size_px(dataset.root / CAMERA_FILE), limit)
 
     @property
     def total(self) -> int:
@@ -103,42 +99,66 @@ class _Source:
 
     @property
     def title(self) -> str:
-        path = self.dataset / DATASET_FILE
-        name = read_json(path).get("name") if path.exists() else None
-        return str(name or self.dataset.resolve().name)
+        name = None if self.dataset.header is None else self.dataset.header.get("name")
+        return str(name or self.dataset.root.resolve().name)
 
     def scenes(self, to: Path) -> Iterator[list[ImageTask]]:
         """The images to show of each scene folder."""
         wanted = {number * self.total // self.count for number in range(self.count)}
         first = 0
         for scene_id, images in self.images.items():
-            numbers = {number - first for number in range(first, first + images) if number in wanted}
+            numbers = [number - first for number in range(first, first + images) if number in wanted]
             first += images
             if numbers:
-                yield list(self._scene(ScenePaths.of(self.dataset, scene_id, self.split), numbers, to))
+                yield list(self._scene(Scene.read(self.dataset.paths(scene_id)), numbers, to))
 
-    def _scene(self, scene: ScenePaths, numbers: set[int], to: Path) -> Iterator[ImageTask]:
-        recorded = read_specs(scene) if scene.scene_spec.exists() else {}
-        for number, labels in enumerate(read_entries(scene)):
-            if number in numbers:
-                self._check_objects(scene, labels)
-                yield ImageTask(scene, labels, recorded.get(labels.im_id), self.infos, self._size_px(), to)
+    def _scene(self, scene: Scene, numbers: list[int], to: Path) -> Iterator[ImageTask]:
+        scene.labelled()  # refuses one that is not
+        for obj_id in np.unique(scene.poses.obj_ids).tolist():
+            self._check_object(scene, obj_id)
+        recorded = read_specs(scene.paths)
+        for number in numbers:
+            image = scene.image(number)
+            spec = recorded.get(image.im_id)
+            if spec is not None and not _fits(spec, image):
+                raise UserError(f"{scene.paths.scene_spec}: image {image.im_id} is not the one of scene_gt.json")
+            yield ImageTask(image, spec, self.infos, self.size_px, to)
 
-    def _size_px(self) -> tuple[int, int]:
-        path = self.dataset / CAMERA_FILE
-        camera = read_json(path)
+    def _check_object(self, scene: Scene, obj_id: int) -> None:
+        """An object is drawn by its box and its diameter."""
+        path = find_models_folder(self.dataset.root) / INFO_FILE
+        if obj_id not in self.infos:
+            raise UserError(f"{scene.paths.scene_gt}: has the object {obj_id}, of which {path} has no entry")
+        diameter = self.infos[obj_id].get("diameter")
+        number = diameter if isinstance(diameter, int | float) and not isinstance(diameter, bool) else math.nan
+        if not 0 < number < _LARGEST_MM:
+            raise UserError(f"{path}: object {obj_id} has diameter {diameter!r}; a positive number of mm is needed")
         try:
-            return int(camera["width"]), int(camera["height"])
-        except (KeyError, TypeError, ValueError):
-            raise UserError(f"{path}: needs the images' width and height") from None
+            box_corners_mm(self.infos[obj_id])
+        except UserError as error:
+            raise UserError(f"{path}: object {obj_id}: {error}") from None
 
-    def _check_objects(self, scene: ScenePaths, labels: ImageEntries) -> None:
-        for entry in labels.gt:
-            if entry.get("obj_id") not in self.infos:
-                raise UserError(
-                    f"{scene.scene_gt}: image {labels.im_id} has the object {entry.get('obj_id')}, "
-                    f"of which {INFO_FILE} has no entry"
-                )
+
+def _size_px(path: Path) -> tuple[int, int] | None:
+    if not path.exists():
+        return None
+    camera = read_json(path)
+    width, height = camera.get("width"), camera.get("height")
+    if width is None and height is None:
+        return None
+    if type(width) is not int or type(height) is not int or min(width, height) < 1:
+        raise UserError(f"{path}: width {width!r} and height {height!r}; positive whole numbers are needed")
+    return width, height
+
+
+def _fits(spec: ImageSpec, image: Image) -> bool:
+    """Whether a record can be of an image, by its numbers."""
+    numbers = range(len(spec.scene.objects))
+    return (
+        spec.view in range(len(spec.scene.views))
+        and len(spec.instances) == len(image.instances)
+        and all(number in numbers for number in spec.instances)
+    )
 
 
 def _write_images(source: _Source, folder: Path, workers: int | None) -> None:
@@ -160,13 +180,15 @@ def _write_images(source: _Source, folder: Path, workers: int | None) -> None:
 def _index_entry(task: ImageTask) -> list[Any]:
     """[key, [object, regressor, visible thousandths, margin in tenths of a degree, ...of the next instance]]."""
     flat: list[int] = []
-    for gt, info, label in zip(task.labels.gt, task.labels.gt_info, task.labels.gt_canonical, strict=True):
-        visible, margin = round(1000 * info["visib_fract"]), round(10 * label["discontinuity_margin_deg"])
-        flat += [gt["obj_id"], label["regressor_index"], visible, margin]
+    for instance in task.image.instances:
+        label, seen = instance.label, instance.visibility
+        assert label is not None and seen is not None  # see ImageTask
+        visible, margin = round(1000 * seen.visib_fract), round(10 * label.discontinuity_margin_deg)
+        flat += [instance.obj_id, label.regressor_index, visible, margin]
     return [task.key, flat]
 
 
-def class_name(obj_id: int, info: Entry) -> str:
+def class_name(obj_id: int, info: ModelInfo) -> str:
     """What an object is called: its id, and its name if models_info.json gives it one."""
     name = info.get("name")
     return f"{obj_id} {name}" if isinstance(name, str) and name else str(obj_id)

@@ -12,8 +12,6 @@ Image = NDArray[np.float32]  # (size, size, 3)
 Colours = NDArray[np.float32]  # (n, 3)
 Range = tuple[float, float]
 
-LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)  # ITU-R BT.709
-
 
 def from_lch(lightness: ArrayLike, chroma: ArrayLike, hue_deg: ArrayLike) -> Colours:
     """(n, 3) sRGB of CIE LCh colours: lightness 0..100, chroma 0 (grey) to about 100, hue in degrees."""

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synthetless.scenes.srgb import LUMINANCE_WEIGHTS
 from synthetless.scenes.textures import masonry, natural, prints, textiles
-from synthetless.scenes.textures.colour import LUMA, Image
+from synthetless.scenes.textures.colour import Image
 
 Painter = Callable[[np.random.Generator, int], Image]
 
@@ -62,7 +63,7 @@ def paint(family: str, seed: int, size_px: int) -> NDArray[np.uint8]:
 def _graded(image: Image) -> Image:
     """The image in 0..1, with mean luminance and contrast brought into range where they are outside."""
     image = np.asarray(np.clip(image, 0, 1), np.float32)
-    luminance = float(LUMA @ cv2.mean(image)[:3])
+    luminance = float(LUMINANCE_WEIGHTS @ cv2.mean(image)[:3])
     wanted = min(max(luminance, LUMINANCE[0]), LUMINANCE[1])
     if wanted != luminance:
         image = image ** np.float32(np.log(wanted) / np.log(np.clip(luminance, 1e-3, 0.999)))

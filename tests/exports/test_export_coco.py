@@ -6,7 +6,9 @@ import contextlib
 import io
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +17,11 @@ from pycocotools.cocoeval import COCOeval
 
 from synthetless.dataset.layout import ScenePaths
 from synthetless.dataset.records import read_scene_json
+from synthetless.errors import UserError
 from synthetless.exports.coco import BoxKind, export_coco
 from synthetless.io.images import decode_mask, decode_rgb
+
+Change = Callable[[dict[str, Any]], object]
 
 
 def _load(path: Path) -> COCO:
@@ -158,3 +163,64 @@ def test_one_of_several_splits_must_be_named(dataset: Path, tmp_path: Path) -> N
     with pytest.raises(ValueError, match="has the splits train_synthetless, val; name one of them"):
         export_coco(copy, tmp_path / "train.json")
     assert export_coco(copy, tmp_path / "train.json", split="val") == 6
+
+
+def _change(name: str, number: int, **changes: object) -> Change:
+    def change(coco: dict[str, Any]) -> None:
+        coco[name][number] |= changes
+
+    return change
+
+
+def _segmentation(**changes: object) -> Change:
+    def change(coco: dict[str, Any]) -> None:
+        coco["annotations"][0]["segmentation"] |= changes
+
+    return change
+
+
+DAMAGES: list[tuple[Change, str]] = [
+    (lambda coco: coco.pop("images"), "images: Field required"),
+    (lambda coco: coco.update(annotations={}), "annotations: Input should be a valid list"),
+    (lambda coco: coco["annotations"].append(5), r"annotations\.\d+: Input should be a valid dictionary, but it is 5"),
+    (lambda coco: coco["images"].append(None), r"images\.3: Input should be a valid dictionary, but it is None"),
+    (lambda coco: coco["categories"].append({}), r"categories\.3\.id: Field required"),
+    (lambda coco: coco["annotations"][0].pop("ignore"), r"annotations\.0\.ignore: Field required"),
+    (_change("images", 0, height=None), r"images\.0\.height: .* valid integer, but it is None"),
+    (_change("images", 0, width=0), r"images\.0\.width: .* greater than or equal to 1, but it is 0"),
+    (_change("images", 0, file_name=7), r"images\.0\.file_name: .* valid string, but it is 7"),
+    (_change("images", 0, id="0"), r"images\.0\.id"),
+    (_change("images", 0, id=77), "annotates image 0, which it does not list"),
+    (_change("annotations", 0, image_id=77), "annotates image 77, which it does not list"),
+    (_change("annotations", 0, category_id=77), "does not list the . visible instances"),
+    (_change("annotations", 0, bbox=[1, 2, 3]), r"annotations\.0\.bbox: .* at least 4 items"),
+    (_change("annotations", 0, bbox="1 2 3 4"), r"annotations\.0\.bbox"),
+    (_change("annotations", 0, area=None), r"annotations\.0\.area"),
+    (_change("annotations", 0, segmentation=[[1, 2, 3, 4]]), r"annotations\.0\.segmentation: .* valid dictionary"),
+    (_segmentation(counts=[1, -2]), r"segmentation\.counts"),
+    (_segmentation(counts=[2**40]), r"segmentation\.counts"),
+    (_segmentation(counts=[1.5]), r"segmentation\.counts"),
+    (_segmentation(counts=None), r"segmentation\.counts"),
+    (_segmentation(size=[48]), r"segmentation\.size"),
+    (_segmentation(size=[0, 0]), r"segmentation\.size"),
+    (_segmentation(size=[2**40, 1]), r"segmentation\.size"),
+]
+
+
+@pytest.mark.parametrize("number", range(len(DAMAGES)))
+def test_a_damaged_coco_file_is_one_line(damaged_copy: Path, tmp_path: Path, number: int) -> None:
+    change, told = DAMAGES[number]
+    scene = ScenePaths.of(damaged_copy, 1)
+    content = json.loads(scene.scene_gt_coco.read_text())
+    change(content)
+    scene.scene_gt_coco.write_text(json.dumps(content))
+    with pytest.raises(UserError, match=rf"000001/scene_gt_coco\.json: .*{told}") as raised:
+        export_coco(damaged_copy, tmp_path / "train.json")
+    assert "\n" not in str(raised.value)
+    assert not (tmp_path / "train.json").exists()
+
+
+@pytest.fixture
+def damaged_copy(dataset: Path, tmp_path: Path) -> Path:
+    """A copy to damage, without pictures, which are not read."""
+    return shutil.copytree(dataset, tmp_path / "copy", ignore=shutil.ignore_patterns("*.png"))

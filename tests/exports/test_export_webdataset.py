@@ -209,3 +209,12 @@ def test_hugging_face_datasets_reads_every_field(
                 coco_mask.area(coco_mask.frPyObjects(rle, *rle["size"]))
                 == decode_mask(scene.mask(im_id, gt_id).read_bytes()).sum()
             )
+
+
+def test_a_dataset_without_images_is_refused(dataset: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(dataset, tmp_path / "copy", ignore=shutil.ignore_patterns("*.png"))
+    for path in copy.rglob("scene_*.json"):
+        path.write_text("{}")
+    with pytest.raises(ValueError, match="copy: holds no images to export"):
+        export_webdataset(copy, tmp_path / "web", workers=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["copy"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 import pytest
@@ -12,7 +12,10 @@ from trees import contents
 
 from synthetless.config import Recipe, load_recipe
 from synthetless.dataset.layout import DATASET_FILE, Part
+from synthetless.generation import estimate as estimation
+from synthetless.generation import executors
 from synthetless.generation import generate as generation
+from synthetless.generation.executors import DropResult, DropTask
 from synthetless.generation.generate import Execution, generate, retry
 from synthetless.io.files import LockedError, in_turn, locked
 
@@ -94,6 +97,32 @@ def test_a_foreign_folder_is_left_as_it_is(recipe: Recipe, tmp_path: Path) -> No
         with pytest.raises(ValueError, match=r"holds notes\.txt, but no dataset\.json"):
             generate(recipe, tmp_path, Execution(workers=1, part=part))
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_an_estimate_writes_nothing(begun: Path, recipe: Recipe, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not even what is missing: another run may be at work there."""
+    (begun / "camera.json").unlink()
+    monkeypatch.setattr(estimation, "_measure", lambda *_: (1.0, 2.0, 1000))
+    before = contents(begun)
+    with locked(begun):
+        assert estimation.estimate(recipe, begun, Execution(workers=1)).images == 4
+    assert contents(begun) == before
+    with pytest.raises(ValueError, match="was begun with seed"):
+        estimation.estimate(recipe.model_copy(update={"seed": 5}), begun, Execution(workers=1))
+
+
+def test_a_note_that_cannot_be_removed_is_named(begun: Path, recipe: Recipe, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder in its place stands for whatever keeps it from being removed."""
+    note = begun / ".failures" / "00000001.json"
+    note.mkdir(parents=True)
+
+    def run(*_: object) -> Generator[DropResult, None, None]:
+        yield DropResult(DropTask(1, ()), made=1)
+
+    monkeypatch.undo()
+    monkeypatch.setattr(executors, "run", run)
+    with pytest.raises(ValueError, match=rf"^{note}: cannot be removed \("):
+        generate(recipe, begun, Execution(workers=1))
 
 
 def test_a_drop_that_is_not_there_is_not_retried(begun: Path, tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ camera: {{width: 64, height: 48, fx: 113, fy: 113, cx: 31.5, cy: 23.5, distance_
 objects: {{count: [1, 4]}}
 render: {{samples: 1}}
 """
-KILLS_OF_RUNS, KILLS_AT_START = 3, 10
+KILLS_OF_RUNS, KILLS_AT_START = 2, 10
 TOO_LITTLE_BYTES = 400 * 2**20
 """Address space in which Python starts, but not what a worker imports."""
 

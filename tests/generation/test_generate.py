@@ -152,7 +152,7 @@ def test_ctrl_c_and_again_gives_the_same_bytes(dataset: Path, recipe: Path, tmp_
     assert time.monotonic() - started < 30
     assert process.returncode == 130
     assert "Traceback" not in stderr
-    assert stderr.strip().splitlines()[-1] == "synthetless: interrupted; run the same command again to go on"
+    assert stderr.strip().splitlines()[-1] == "synthetless: interrupted; run the same command again to continue"
     made = len(records.read_scene_json(ScenePaths.of(out, 1).scene_camera))
     assert 1 <= made < 6, "what is made can be looked at"
     _generate(recipe, out)

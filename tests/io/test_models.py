@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from mesh_files import TRIANGLES, binary_ply
 
-from synthetless.io.models import ModelError, load_models
+from synthetless.errors import UserError
+from synthetless.io.models import load_models
 
 
 @pytest.fixture
@@ -71,6 +73,13 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "object without info": (lambda f: _edit_info(f, lambda i: i.pop("2")), "no entry for object 2"),
     "no diameter": (lambda f: _edit_info(f, lambda i: i["1"].pop("diameter")), "object 1 has diameter None"),
     "negative diameter": (lambda f: _edit_info(f, lambda i: i["1"].update(diameter=-3)), "diameter -3"),
+    "diameter is text": (lambda f: _edit_info(f, lambda i: i["1"].update(diameter="37")), "diameter '37'"),
+    "huge diameter": (lambda f: _edit_info(f, lambda i: i["1"].update(diameter=10**400)), "object 1 has diameter 1000"),
+    "box is a list": (lambda f: _edit_info(f, lambda i: i["1"].update(size_x=[30])), "object 1 has size_x [30]"),
+    "box is a mapping": (lambda f: _edit_info(f, lambda i: i["2"].update(size_z={})), "object 2 has size_z {}"),
+    "box is text": (lambda f: _edit_info(f, lambda i: i["1"].update(size_x="30")), "object 1 has size_x '30'"),
+    "box is not finite": (lambda f: _edit_info(f, lambda i: i["1"].update(size_x=float("nan"))), "size_x nan"),
+    "deep info": (lambda f: (f / "models_info.json").write_text("[" * 100_000), "is nested too deeply"),
     "metres": (lambda f: _edit_info(f, lambda i: i["1"].update(size_x=0.03)), "are its units millimetres"),
 }
 
@@ -79,22 +88,41 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
 def test_a_bad_folder_is_told_in_one_line(folder: Path, kind: str) -> None:
     damage, expected = DAMAGE[kind]
     damage(folder)
-    with pytest.raises(ModelError) as error:
+    with pytest.raises(UserError) as error:
         load_models(folder)
     assert expected in str(error.value)
     assert "\n" not in str(error.value)
 
 
 def test_a_missing_or_empty_folder_is_told(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="no such models folder"):
+    with pytest.raises(UserError, match="no such models folder"):
         load_models(tmp_path / "none")
-    with pytest.raises(ModelError, match="holds no models"):
+    with pytest.raises(UserError, match="holds no models"):
         load_models(tmp_path)
 
 
 def test_an_unknown_object_is_told(folder: Path) -> None:
-    with pytest.raises(ModelError, match="no mesh for object 9; the folder holds objects 1, 2"):
+    with pytest.raises(UserError, match="no mesh for object 9; the folder holds objects 1, 2"):
         load_models(folder, (9,))
+
+
+def test_points_that_no_face_uses_do_not_count(folder: Path) -> None:
+    """The box of the others is the one that models_info.json states, and a dataset carries a mesh without them."""
+    path = folder / "obj_000001.ply"
+    path.write_bytes(binary_ply(TRIANGLES, stray=3))
+    model = load_models(folder)[1]
+    np.testing.assert_array_equal(np.ptp(model.vertices_mm, axis=0), [30, 20, 10])
+    np.testing.assert_array_equal(np.ptp(model.box_corners_mm, axis=0), [30, 20, 10])
+    path.write_bytes(model.to_ply())
+    again = load_models(folder)[1]
+    np.testing.assert_array_equal(again.vertices_mm, model.vertices_mm)
+    np.testing.assert_array_equal(again.faces, model.faces)
+    assert again.digest == model.digest
+
+
+def test_a_dataset_carries_the_file_itself_where_it_is_the_mesh(folder: Path) -> None:
+    model = load_models(folder)[1]
+    assert model.to_ply() == model.path.read_bytes()
 
 
 @pytest.mark.tless

@@ -6,7 +6,9 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -65,6 +67,29 @@ def test_an_error_is_told_as_it_was_raised(workers: int) -> None:
 def test_a_killed_process_is_told_in_one_line() -> None:
     with pytest.raises(ChildProcessError, match="was killed"):
         list(each(_die, range(6), 2, "numbers", "number"))
+
+
+@pytest.mark.parametrize("age_s", [0.0, 0.1, 0.3, 1.0])
+def test_processes_killed_while_they_start_are_told_in_one_line(age_s: float) -> None:
+    """Every one of them, as soon as it is so old."""
+    ended = threading.Event()
+
+    def kill() -> None:
+        while not ended.wait(0.01):
+            for child in psutil.Process().children():
+                with suppress(psutil.NoSuchProcess):
+                    if time.time() - child.create_time() >= age_s and "spawn_main" in " ".join(child.cmdline()):
+                        child.kill()
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    try:
+        with pytest.raises(ChildProcessError, match="was killed"), processes(2, 2) as run:
+            for _ in range(100):
+                list(run(_square, range(12)))
+    finally:
+        ended.set()
+        killer.join()
 
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])

@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from trees import contents
 
-from synthetless.dataset.labels import box_corners_mm
+from synthetless.dataset.labels import BOX_EDGES, box_corners_mm
 from synthetless.io.files import read_bytes
 from synthetless.io.images import decode_mask, decode_rgb
-from synthetless.preview import overlays, write_preview
+from synthetless.preview import write_preview
+from synthetless.preview.image import box_lines, outline
 from tests.preview.conftest import HOSTILE_NAME, images_of
 
 K = np.array([[300.0, 0, 63.2], [0, 298.0, 47.7], [0, 0, 1]])
@@ -60,7 +61,7 @@ def test_canonical_boxes_are_drawn_where_the_labels_put_their_corners(small_prev
         for label, instance in zip(image.labels.gt_canonical, drawn, strict=True):
             ends = np.array(instance["canonical"]["box"]).reshape(12, 2, 2)
             corners = np.array(label["bbox3d_corners_2d"])
-            expected = np.array([[corners[a], corners[b]] for a, b in overlays.BOX_EDGES])
+            expected = np.array([[corners[a], corners[b]] for a, b in BOX_EDGES])
             np.testing.assert_allclose(ends, expected, atol=0.051)
 
 
@@ -75,7 +76,7 @@ def test_outlines_fill_what_the_masks_cover(small_preview: Path, small_dataset: 
 
 @given(hnp.arrays(np.bool_, st.tuples(st.integers(1, 24), st.integers(1, 24))))
 def test_outlines_stay_within_a_pixel_of_any_mask(mask: np.ndarray) -> None:
-    filled = _filled(overlays.outline(mask), mask.shape)
+    filled = _filled(outline(mask), mask.shape)
     near = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     assert not (filled & ~near).any()
     assert filled.any() == mask.any()
@@ -85,10 +86,10 @@ def test_outlines_stay_within_a_pixel_of_any_mask(mask: np.ndarray) -> None:
 def test_lines_stay_finite_and_before_the_camera(depth_mm: float, seed: int) -> None:
     R = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
     corners = box_corners_mm({f"min_{a}": -40 for a in "xyz"} | {f"size_{a}": 80 for a in "xyz"})
-    lines = overlays.box_lines(K, R, np.array([5.0, -3.0, depth_mm]), corners)
+    lines = box_lines(K, R, np.array([5.0, -3.0, depth_mm]), corners)
     inside = (corners @ R.T + [5.0, -3.0, depth_mm])[:, 2] > 10
     assert np.isfinite(lines).all() if lines else not inside.any()
-    assert len(lines) == sum(inside[a] or inside[b] for a, b in overlays.BOX_EDGES)
+    assert len(lines) == sum(inside[a] or inside[b] for a, b in BOX_EDGES)
     assert all(len(line) == SEGMENT for line in lines)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,11 @@ import pytest
 from synthetless.config import Recipe, load_recipe
 from synthetless.dataset.labels import label_scene
 from synthetless.dataset.layout import SYMMETRIES_FILE
+from synthetless.io.color import mean_luminance
 from synthetless.io.files import read_bytes
 from synthetless.io.images import decode_rgb
-from synthetless.preview.statistics import statistics
-from synthetless.preview.statistics.collect import Instances, Observations, mean_luminance
-from synthetless.preview.statistics.distributions import Distribution, distributions, labelled_classes
-from synthetless.preview.statistics.summary import NEAR_JUMP_DEG
+from synthetless.preview.distributions import Distribution, Observations, distributions, labelled_classes
+from synthetless.preview.statistics import NEAR_JUMP_DEG, statistics
 from synthetless.scenes.sampling import Catalogue, sample_scene
 from synthetless.symmetry import SymmetryTable
 from tests.preview.conftest import images_of
@@ -34,11 +34,16 @@ def _seen(recipe: Recipe, drops: int = DROPS, seed: int = 4) -> Observations:
     catalogue = Catalogue(dict.fromkeys(recipe.objects.ids or IDS, 0.06), {})
     scenes = [sample_scene(recipe, catalogue, seed, drop) for drop in range(drops)]
     ids = np.array([item.obj_id for scene in scenes for item in scene.objects])
-    n, nothing = len(ids), np.zeros(len(ids))
-    poses = np.tile(np.eye(3), (n, 1, 1)), np.tile([0.0, 0.0, 700.0], (n, 1))
-    instances = Instances(ids, nothing, nothing.astype(np.int64), *poses, *poses)
-    counts = np.array([len(scene.objects) for scene in scenes])
-    return Observations(instances, counts, [s.views[0] for s in scenes], np.ones(drops), scenes, np.full(9, 0.4))
+    return Observations(
+        obj_id=ids,
+        visib_fract=np.zeros(len(ids)),
+        distance_mm=np.full(len(ids), 700.0),
+        objects_per_image=np.array([len(scene.objects) for scene in scenes]),
+        views=[scene.views[0] for scene in scenes],
+        exposure_gains=np.ones(drops),
+        drops=scenes,
+        luminance=np.full(9, 0.4),
+    )
 
 
 def _verdicts(seen: Observations, recipe: Recipe) -> dict[str, Distribution]:
@@ -83,14 +88,7 @@ def test_a_dataset_of_another_recipe_differs_there_and_nowhere_else(override: st
 
 def test_release_rotations_that_are_not_uniform_are_found(by_default: Observations) -> None:
     upright = [s for s in by_default.drops if abs(s.objects[0].release.rotation_wxyz[0]) < 0.5]
-    few = Observations(
-        by_default.instances,
-        *[getattr(by_default, n) for n in ("objects_per_image", "views")],
-        by_default.exposure_gains,
-        upright,
-        by_default.luminance,
-    )
-    assert _verdicts(few, Recipe())["release"].verdict == "differs"
+    assert _verdicts(replace(by_default, drops=upright), Recipe())["release"].verdict == "differs"
 
 
 def test_expected_and_counts_have_the_same_sum(by_default: Observations) -> None:
@@ -147,7 +145,7 @@ def test_plots_are_the_same_each_time_and_hold_no_live_text(by_default: Observat
     pytest.importorskip("matplotlib", reason=MATPLOTLIB)
     from matplotlib import rc_context
 
-    from synthetless.preview.statistics import plots
+    from synthetless.preview import plots
 
     hostile = Distribution(
         "k", "g", "t", "", 3, (), ("<script>$a$</script>", "$\\frac", "b&'\""), (1, 2, 0), None, None, None
@@ -161,7 +159,7 @@ def test_plots_are_the_same_each_time_and_hold_no_live_text(by_default: Observat
 @pytest.mark.filterwarnings("error")
 def test_long_names_of_photographs_leave_room_for_the_bars() -> None:
     pytest.importorskip("matplotlib", reason=MATPLOTLIB)
-    from synthetless.preview.statistics.plots import distribution_plot
+    from synthetless.preview.plots import distribution_plot
 
     names = tuple(f"polyhaven_exterior_concrete_tile_facade_{number:02}_diff_1k.jpg" for number in range(30))
     svg = distribution_plot(Distribution("k", "g", "t", "", 30, (), names, (1,) * 30, None, None, None)).decode()

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from synthetless.preview.statistics import sphere
-from synthetless.preview.statistics.uniformity import categories_p, rotations_p, uniform_p
+from synthetless.preview import statistics
+from synthetless.preview.distributions import categories_p, rotations_p, uniform_p
 
 REPEATS = 400
 
@@ -67,11 +67,11 @@ def test_views_counted_several_times_do_not_make_a_bias_surer() -> None:
 
 def test_cells_have_equal_area_on_the_sphere_and_on_the_map() -> None:
     directions = np.random.default_rng(10).normal(size=(200_000, 3))
-    counts = sphere.cell_counts(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    counts = statistics.cell_counts(directions / np.linalg.norm(directions, axis=1, keepdims=True))
     assert stats.chisquare(counts.ravel()).pvalue > 1e-3
-    x, y = np.moveaxis(sphere.cell_outlines(points=200), -1, 0)
+    x, y = np.moveaxis(statistics.cell_outlines(points=200), -1, 0)
     areas = np.abs((x * np.roll(y, -1, axis=-1) - y * np.roll(x, -1, axis=-1)).sum(axis=-1)) / 2
-    np.testing.assert_allclose(areas, 4 * np.pi / sphere.CELLS, rtol=2e-3)
+    np.testing.assert_allclose(areas, 4 * np.pi / statistics.CELLS, rtol=2e-3)
 
 
 @settings(max_examples=25)
@@ -79,9 +79,9 @@ def test_cells_have_equal_area_on_the_sphere_and_on_the_map() -> None:
 def test_every_view_is_in_one_cell(views: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     R, t = Rotation.random(views, random_state=rng).as_matrix(), rng.normal(size=(views, 3))
-    directions = sphere.viewing_directions(R, t)
+    directions = statistics.viewing_directions(R, t)
     np.testing.assert_allclose(np.einsum("nij,nj->ni", R, directions) * np.linalg.norm(t, axis=1)[:, None], -t)
-    assert sphere.cell_counts(directions).sum() == views
+    assert statistics.cell_counts(directions).sum() == views
 
 
 def test_expected_coverage_is_that_of_uniform_views() -> None:
@@ -89,5 +89,7 @@ def test_expected_coverage_is_that_of_uniform_views() -> None:
     found = []
     for _ in range(100):
         directions = rng.normal(size=(150, 3))
-        found.append(sphere.coverage(sphere.cell_counts(directions / np.linalg.norm(directions, axis=1)[:, None])))
-    assert np.mean(found) == pytest.approx(sphere.uniform_coverage(150), abs=0.01)
+        found.append(
+            statistics.coverage(statistics.cell_counts(directions / np.linalg.norm(directions, axis=1)[:, None]))
+        )
+    assert np.mean(found) == pytest.approx(statistics.uniform_coverage(150), abs=0.01)

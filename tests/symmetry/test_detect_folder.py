@@ -5,16 +5,17 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import mesh_files
 import numpy as np
 import pytest
 import trimesh
 from detect_shapes import box, cone, l_bracket
 
 from synthetless.io.files import read_json
-from synthetless.io.models import load_models
+from synthetless.io.meshes import read_mesh
+from synthetless.io.models import find_meshes, load_models
 from synthetless.symmetry import SymmetryGroup, SymmetryTable
 from synthetless.symmetry.detection import DetectedFolder, detect_folder, report
-from synthetless.symmetry.detection.meshes import find_meshes, read_mesh
 
 L_BRACKET = SymmetryGroup.from_name("C2", axis=(1, 0, 1), offset_mm=(0, 10, 0))
 
@@ -132,7 +133,7 @@ def test_the_diameter_is_the_largest_distance(tmp_path: Path) -> None:
     mesh = read_mesh(tmp_path / "1.ply", scale=2.0)
     expected = max(np.linalg.norm(mesh.vertices_mm - v, axis=1).max() for v in mesh.vertices_mm)
     assert mesh.diameter_mm == pytest.approx(expected, rel=1e-12)
-    info = mesh.info()
+    info = mesh.bop_info()
     assert info["min_z"] == mesh.vertices_mm[:, 2].min()
     assert info["size_y"] == np.ptp(mesh.vertices_mm[:, 1])
 
@@ -143,7 +144,7 @@ def _ply(vertices: str, faces: str, n: int, m: int) -> str:
 
 
 BROKEN = {
-    "cut off.ply": ("ply\nformat ascii 1.0\nelement vert", "not a readable mesh"),
+    "cut off.ply": ("ply\nformat ascii 1.0\nelement vert", "no line 'end_header'"),
     "no faces.ply": (_ply("0 0 0\n1 0 0\n0 1 0", "", 3, 0), "holds no faces"),
     "nan.ply": (_ply("0 0 0\n1 nan 0\n0 1 0\n0 0 1", "3 0 1 2\n3 0 1 3", 4, 2), "vertex 1 is [1.0, nan, 0.0]"),
     "flat.ply": (_ply("0 0 0\n9 0 0\n9 9 0\n0 9 0", "3 0 1 2\n3 0 2 3", 4, 2), "lie in one plane"),
@@ -162,6 +163,31 @@ def test_a_broken_mesh_is_named_in_one_line(tmp_path: Path, name: str) -> None:
     assert message.startswith(str(tmp_path / name))
     assert reason in message or name == "far.ply"
     assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        mesh_files.ply(mesh_files.L_PRISM.turned(2)),
+        mesh_files.binary_ply(mesh_files.HEXAGON),
+        mesh_files.binary_ply(mesh_files.TRIANGLES, stray=2),
+        mesh_files.binary_ply(mesh_files.TRIANGLES) + b"spare",
+    ],
+)
+def test_the_models_folder_holds_the_meshes_that_were_measured(content: bytes, tmp_path: Path) -> None:
+    """Concave polygons, polygons of several sizes, points that no face uses: other readers read them otherwise."""
+    cad, out = tmp_path / "cad", tmp_path / "models"
+    cad.mkdir()
+    (cad / "obj_000001.ply").write_bytes(content)
+    detected = detect_folder(cad, workers=1)
+    detected.write_models(out)
+    model = load_models(out)[1]
+    other = trimesh.load_mesh(out / "obj_000001.ply", process=False)
+    np.testing.assert_array_equal(other.vertices, model.vertices_mm)
+    np.testing.assert_array_equal(other.faces, model.faces)
+    assert other.is_watertight
+    assert other.bounding_box.extents.tolist() == [model.info[f"size_{axis}"] for axis in "xyz"]
+    assert model.diameter_mm < 80
 
 
 def test_folders_without_meshes_and_wrong_numbers(tmp_path: Path) -> None:

@@ -10,23 +10,23 @@ import pytest
 from detect_shapes import box, prism
 from numpy.typing import NDArray
 
+from synthetless.io.meshes import TriangleMesh
 from synthetless.symmetry import SymmetryGroup, SymmetryTable
 from synthetless.symmetry.detection.detect import measure
-from synthetless.symmetry.detection.meshes import Mesh
 from synthetless.symmetry.detection.pictures import draw_table, picture
 from synthetless.symmetry.table import SymmetryEntry
 
 VIEWS_PX, HEAD_PX = 1200, 34
 
 
-def drawn(mesh: Mesh, *groups: SymmetryGroup) -> NDArray[np.uint8]:
+def drawn(mesh: TriangleMesh, *groups: SymmetryGroup) -> NDArray[np.uint8]:
     fits = [measure(mesh.vertices_mm, mesh.faces, mesh.diameter_mm, group) for group in groups]
     return picture("object 1", mesh, fits, 0.01 * mesh.diameter_mm)
 
 
-def mesh_of(x: float, y: float, z: float) -> Mesh:
+def mesh_of(x: float, y: float, z: float) -> TriangleMesh:
     part = box(x, y, z)
-    return Mesh(np.asarray(part.vertices), np.asarray(part.faces), float(np.linalg.norm(part.extents)))
+    return TriangleMesh(np.asarray(part.vertices), np.asarray(part.faces), is_verbatim=False)
 
 
 def saturation(image: NDArray[np.uint8]) -> NDArray[np.int_]:

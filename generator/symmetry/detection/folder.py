@@ -8,16 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from synthetless.errors import UserError
 from synthetless.io.files import atomic_write, write_json
+from synthetless.io.meshes import read_mesh
+from synthetless.io.models import find_meshes
 from synthetless.io.parallel import each
 from synthetless.symmetry.atlas import SCHEMES, Scheme
 from synthetless.symmetry.detection.detect import Detected, GroupFit, detect
-from synthetless.symmetry.detection.meshes import find_meshes, read_mesh, unit_warning
 from synthetless.symmetry.groups import SymmetryGroup
 from synthetless.symmetry.table import MODELS_INFO_FILE, SymmetryEntry, SymmetryTable
+
+_SMALLEST_MM, _LARGEST_MM = 2.0, 2000.0
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,12 @@ class DetectedObject:
     @property
     def warning(self) -> str | None:
         """What is odd about its size, if anything."""
-        return unit_warning(self.detected.diameter_mm)
+        diameter_mm, ask = self.detected.diameter_mm, "are its units"
+        if diameter_mm < _SMALLEST_MM:
+            return f"is only {diameter_mm:.3g} mm across: {ask} metres? (--scale 1000 turns them into millimetres)"
+        if diameter_mm > _LARGEST_MM:
+            return f"is {diameter_mm:.0f} mm across: {ask} micrometres? (--scale 0.001 turns them into millimetres)"
+        return None
 
 
 @dataclass(frozen=True)
@@ -92,11 +99,8 @@ class DetectedFolder:
         write_json(to / MODELS_INFO_FILE, {str(o.obj_id): _models_info(o) for o in self.objects})
 
     def _ply(self, o: DetectedObject) -> bytes:
-        if o.path.suffix.lower() == ".ply" and self.scale == 1:
-            return o.path.read_bytes()
         mesh = read_mesh(o.path, self.scale)
-        data: Any = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False).export(file_type="ply")
-        return bytes(data)
+        return o.path.read_bytes() if mesh.is_verbatim else mesh.to_ply()
 
 
 def detect_folder(
@@ -143,11 +147,13 @@ class _Task:
 
 def _detect_file(task: _Task) -> DetectedObject:
     mesh = read_mesh(task.path, task.scale)
+    if mesh.is_flat:
+        raise UserError(f"{task.path}: all its points lie in one plane; a part with a thickness is needed")
     try:
         detected = detect(mesh.vertices_mm, mesh.faces, mesh.diameter_mm, task.tolerance_percent, task.declared)
     except ValueError as error:
         raise UserError(f"{task.path}: {error}") from error
-    return DetectedObject(task.obj_id, task.path, mesh.info(), detected)
+    return DetectedObject(task.obj_id, task.path, mesh.bop_info(), detected)
 
 
 def _declared(folder: Path) -> dict[int, SymmetryGroup]:

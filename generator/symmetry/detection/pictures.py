@@ -20,12 +20,13 @@ from synthetless.annotation.raycast import RayCaster
 from synthetless.errors import UserError
 from synthetless.io.files import atomic_write
 from synthetless.io.images import encode_png
+from synthetless.io.meshes import TriangleMesh, read_mesh
+from synthetless.io.models import find_meshes
 from synthetless.io.parallel import each
 from synthetless.scenes.spec import Intrinsics
 from synthetless.symmetry.detection.detect import GroupFit, measure
 from synthetless.symmetry.detection.distance import PIECE, Surface
 from synthetless.symmetry.detection.folder import DetectedFolder
-from synthetless.symmetry.detection.meshes import Mesh, find_meshes, read_mesh
 from synthetless.symmetry.detection.report import group_cells
 from synthetless.symmetry.detection.residual import moved, spread_elements
 from synthetless.symmetry.groups import SymmetryGroup
@@ -121,7 +122,7 @@ def _draw(task: _Task) -> None:
     write_picture(task.target, picture(task.title, mesh, fits, tolerance_mm))
 
 
-def picture(title: str, mesh: Mesh, fits: Sequence[GroupFit], tolerance_mm: float) -> Image:
+def picture(title: str, mesh: TriangleMesh, fits: Sequence[GroupFit], tolerance_mm: float) -> Image:
     """One row of views per fit: (H, W, 3) RGB.
 
     The colour of a surface point is its largest deviation over (at most 16, evenly chosen) elements of the group; a
@@ -167,7 +168,7 @@ class _Axis(NamedTuple):
 
 
 class _Views:
-    def __init__(self, mesh: Mesh) -> None:
+    def __init__(self, mesh: TriangleMesh) -> None:
         low, high = mesh.vertices_mm.min(axis=0), mesh.vertices_mm.max(axis=0)
         self._center, self._diameter = (low + high) / 2, mesh.diameter_mm
         self._cameras = [_camera(mesh, -normalise(d), self._center) for d in _DIRECTIONS]
@@ -234,7 +235,7 @@ class _Views:
             _line(image, pixels[first], pixels[last], axis.pen)
 
 
-def _camera(mesh: Mesh, forward: Floats, center: Floats) -> _Camera:
+def _camera(mesh: TriangleMesh, forward: Floats, center: Floats) -> _Camera:
     """A camera that looks along `forward`, z up, and sees the whole part in the middle of the tile."""
     right = normalise(np.cross(forward, [0.0, 0.0, 1.0]))
     R = np.stack([right, np.cross(forward, right), forward])

@@ -9,22 +9,51 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from synthetless.config import BUILTIN, Recipe
-from synthetless.preview.statistics.collect import Observations
-from synthetless.preview.statistics.uniformity import categories_p, rotations_p, uniform_p
-from synthetless.scenes.spec import ObjectSpec
+from synthetless.scenes.sampling import lamp_warmth
+from synthetless.scenes.spec import ObjectSpec, SceneSpec, View
+from synthetless.scenes.srgb import srgb_from_linear
 from synthetless.scenes.textures import FAMILIES, PhotoTexture
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 Bounds = tuple[float, float]
 Verdict = Literal["as asked", "differs", "too few to judge", "not prescribed"]
 
 SIGNIFICANCE = 1e-4
 """A deviation that the recipe would bring about less often than this is called one: there are some thirty tests."""
 
+FEWEST_VALUES = 20
+_FEWEST_EXPECTED = 5.0  # in each category, for the chi-squared approximation to hold
 _BINS = 24
-_CANDLE_GREEN = 0.56  # linear green of a lamp of warmth 1, see scenes.sampling
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """What a dataset says of itself: N labelled instances in M images.
+
+    Attributes:
+        obj_id: (N,) object ids.
+        visib_fract: (N,).
+        distance_mm: (N,) from the camera to the model's origin.
+        objects_per_image: (M,) labelled instances.
+        views: the camera of each image that was recorded.
+        exposure_gains: of the same images.
+        drops: the scenes that those images show, each once.
+        luminance: mean displayed luminance, 0..1, of some images, evenly spread.
+    """
+
+    obj_id: Integers
+    visib_fract: Floats
+    distance_mm: Floats
+    objects_per_image: Integers
+    views: Sequence[View]
+    exposure_gains: Floats
+    drops: Sequence[SceneSpec]
+    luminance: Floats
 
 
 @dataclass(frozen=True)
@@ -69,7 +98,7 @@ class Distribution:
 
 def labelled_classes(seen: Observations, offered: Sequence[int], recipe: Recipe | None) -> Distribution:
     """Labelled instances per class; ``offered`` are the object ids that were drawn from."""
-    found = Counter(seen.instances.obj_id.tolist())
+    found = Counter(seen.obj_id.tolist())
     ids = sorted({*offered, *found})
     drawn = dict.fromkeys(offered, 1.0) if recipe is not None else None
     repeats = recipe.camera.views_per_drop if recipe is not None else 1
@@ -95,9 +124,8 @@ def _labels(seen: Observations) -> Iterator[Distribution]:
     counts = Counter(seen.objects_per_image.tolist())
     named = {str(n): counts[n] for n in range(max(counts, default=0) + 1)}
     yield _categories("labels_per_image", "labels", "Labelled instances of an image", named, None, "")
-    yield _histogram("visib_fract", "labels", "Visible fraction", seen.instances.visib_fract, (0.0, 1.0))
-    distance_m = np.linalg.norm(seen.instances.t_m2c, axis=1) / 1000
-    yield _histogram("object_distance", "labels", "Distance of the objects, m", distance_m)
+    yield _histogram("visib_fract", "labels", "Visible fraction", seen.visib_fract, (0.0, 1.0))
+    yield _histogram("object_distance", "labels", "Distance of the objects, m", seen.distance_mm / 1000)
 
 
 def _objects(seen: Observations, recipe: Recipe) -> Iterator[Distribution]:
@@ -110,7 +138,7 @@ def _objects(seen: Observations, recipe: Recipe) -> Iterator[Distribution]:
     yield _categories("objects_per_drop", "objects", "Objects dropped", named, weights, f"each of {low} to {high}")
     yield _release(items)
     if recipe.objects.tint == 0:
-        grey = np.array([_displayed(item.material.albedo[0]) for item in items])
+        grey = srgb_from_linear(np.array([item.material.albedo[0] for item in items]))
         yield _uniform("grey", "objects", "Grey, as displayed", grey, recipe.objects.grey)
     for name, bounds in (("roughness", recipe.objects.roughness), ("specular", recipe.objects.specular)):
         values = np.array([getattr(item.material, name) for item in items])
@@ -150,7 +178,7 @@ def _light(seen: Observations, recipe: Recipe) -> Iterator[Distribution]:
     ):
         values = np.array([getattr(spec.light, name) for spec in seen.drops])
         yield _uniform(f"light_{name}", "light", title, values, bounds)
-    warmth = np.array([(1 - spec.light.color[1]) / (1 - _CANDLE_GREEN) for spec in seen.drops])
+    warmth = np.array([lamp_warmth(spec.light) for spec in seen.drops])
     yield _uniform("light_warmth", "light", "Warmth of the lamp", warmth, asked.warmth)
     ambient = np.array([spec.ambient.level for spec in seen.drops])
     yield _uniform("ambient", "light", "Ambient level", ambient, asked.ambient)
@@ -260,6 +288,51 @@ def _range(values: Floats) -> Bounds:
     return (low, high) if high - low > 1e-9 else (low - 0.5, high + 0.5)
 
 
-def _displayed(linear: float) -> float:
-    """sRGB value of a linear one (IEC 61966-2-1)."""
-    return 12.92 * linear if linear <= 0.0031308 else 1.055 * float(linear) ** (1 / 2.4) - 0.055
+# How likely a deviation as large as the one seen is, had the recipe been kept: None where there are too few values.
+
+
+def uniform_p(values: Floats, low: float, high: float) -> float | None:
+    """Whether values are uniform in [low, high]; 0 if one lies outside.
+
+    Kolmogorov and Smirnov's test, which sees a slope or a shift, and Pearson's over bins, which sees a gap or a peak;
+    the smaller p-value counts, twice, since there are two (Bonferroni).
+    """
+    slack = _ROUNDING * max(1.0, abs(low), abs(high))
+    if values.size and (values.min() < low - slack or values.max() > high + slack):
+        return 0.0
+    if values.size < FEWEST_VALUES or high - low <= slack:
+        return None
+    bins = min(_BINS, int(values.size // _FEWEST_EXPECTED))
+    counts = np.histogram(np.clip(values, low, high), bins, (low, high))[0]
+    binned = float(stats.chisquare(counts).pvalue)
+    return min(1.0, 2 * min(binned, float(stats.kstest(values, stats.uniform(low, high - low).cdf).pvalue)))
+
+
+def categories_p(counts: Sequence[int], expected: Sequence[float], repeats: float = 1.0) -> float | None:
+    """Whether counts are those of independent draws with the expected frequencies: Pearson's chi-squared test.
+
+    Args:
+        counts: of each category.
+        expected: of each category, with the same sum; 0 for what must not occur.
+        repeats: how often each draw was counted.
+    """
+    found, wanted = np.array(counts) / repeats, np.array(expected) / repeats
+    if (found[wanted == 0] > 0).any():
+        return 0.0
+    found, wanted = found[wanted > 0], wanted[wanted > 0]
+    if len(wanted) < 2 or wanted.min() < _FEWEST_EXPECTED:
+        return None
+    return float(stats.chi2.sf(((found - wanted) ** 2 / wanted).sum(), len(wanted) - 1))
+
+
+def rotations_p(wxyz: Floats) -> float | None:
+    """Whether rotations, quaternions (N, 4), are uniform on SO(3): Bingham's test of the axes +-q in four dimensions.
+
+    S = p(p + 2)/2 n (tr T^2 - 1/p), T the mean of q q^T, is chi-squared with (p - 1)(p + 2)/2 degrees of freedom
+    (Mardia and Jupp, Directional Statistics, 2000, section 10.7.1), here with p = 4.
+    """
+    if len(wxyz) < FEWEST_VALUES:
+        return None
+    q = wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)
+    scatter = q.T @ q / len(q)
+    return float(stats.chi2.sf(12 * len(q) * (np.trace(scatter @ scatter) - 0.25), 9))

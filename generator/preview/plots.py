@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from synthetless.errors import UserError
-from synthetless.preview.statistics import sphere
-from synthetless.preview.statistics.distributions import Distribution
-from synthetless.preview.statistics.summary import NEAR_JUMP_DEG, ClassStatistics, Statistics
+from synthetless.preview.distributions import Distribution
+from synthetless.preview.statistics import CELLS, NEAR_JUMP_DEG, ClassStatistics, Statistics, cell_outlines
 from synthetless.symmetry.atlas import SCHEMES
 
 if TYPE_CHECKING:
@@ -152,7 +151,7 @@ def sphere_plot(of: ClassStatistics) -> bytes:
     from matplotlib.patches import Ellipse
 
     figure, _ = _figure(3.4, 0.98, axes=False)
-    cells = sphere.cell_outlines().reshape(sphere.CELLS, -1, 2)
+    cells = cell_outlines().reshape(CELLS, -1, 2)
     for column, (title, views) in enumerate((("true", of.views), ("canonical", of.views_canonical))):
         axes = figure.add_subplot(1, 2, column + 1)
         counts = np.array(views).ravel()
