@@ -101,17 +101,17 @@ def compare_command(
 
 
 def need_torch() -> None:
-    """Refuse in one line where the extra is not installed.
+    """Refuse in one line where the extra is not installed; torch itself is imported when it is needed.
 
     Raises:
-        UserError: torch cannot be imported.
+        UserError: torch cannot be found.
     """
+    from importlib.util import find_spec
+
     from synthetless.errors import UserError
 
-    try:
-        import torch  # noqa: F401
-    except ImportError as error:
-        raise UserError(f"this command needs torch ({error}): pip install 'synthetless[learn]'") from None
+    if find_spec("torch") is None:
+        raise UserError("this command needs torch: pip install 'synthetless[learn]'")
 
 
 def _words(text: str) -> list[str]:
@@ -150,10 +150,11 @@ def train_command(
     need_torch()
     from synthetless.config import load_settings
     from synthetless.learning.settings import Training
-    from synthetless.learning.train import PAGE_FILE, train
 
     given = [*(overrides or []), *([f'labels="{labels}"'] if labels is not None else [])]
     training = load_settings(Training, config, given)
+    from synthetless.learning.train import PAGE_FILE, train  # after the settings: a wrong one is told at once
+
     steps = training.schedule.steps
 
     def tell(record: dict[str, Any]) -> None:

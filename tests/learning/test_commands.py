@@ -16,10 +16,9 @@ from synthetless.learning.settings import Training, training_page
 
 ROOT = Path(__file__).resolve().parents[2]
 WITHOUT_TORCH = (
-    "class Refuse:\n"
-    "    def find_spec(self, name, path=None, target=None):\n"
-    "        if name.partition('.')[0] == 'torch': raise ImportError('No module named torch')\n"
-    "import sys; sys.meta_path.insert(0, Refuse())\n"
+    "import importlib.util as util\n"
+    "found = util.find_spec\n"
+    "util.find_spec = lambda name, *more: None if name == 'torch' else found(name, *more)\n"
 )
 
 
