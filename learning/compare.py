@@ -5,7 +5,8 @@ Crops are ray cast (``stream``); a run is one label set and one seed, on one thr
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from synthetless.dataset.reader import Dataset
 from synthetless.errors import UserError
 from synthetless.io.files import atomic_write, write_json
 from synthetless.io.images import encode_png
 from synthetless.io.models import ObjectModel, load_models
 from synthetless.io.parallel import each
 from synthetless.learning.crops import CropBatcher, CropNet
+from synthetless.learning.data import crops_of, sample_of
 from synthetless.learning.fit import Record, Schedule, fit
 from synthetless.learning.pages import Curve, Section, line_chart, write_page
 from synthetless.learning.solve import solve_pose
@@ -33,6 +36,10 @@ Floats = NDArray[np.float64]
 RECALL_DEG = (5.0, 10.0, 20.0)
 _ELEVATIONS_DEG = ((-90.0, 40.0), (40.0, 70.0), (70.0, 90.1))
 _MARGINS_DEG = ((0.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20.0, 180.1))
+_UPRIGHT_DEG = 10.0
+"""How far the axis of a part that stands upright may lean."""
+_VISIBLE = 0.6
+"""Share of a rendered part that must be visible."""
 _FILES = ("pixels", "obj_ids", "R_m2c", "t_m2c", "K", "elevation_deg")
 _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)]
 _PICTURES, _PICTURE_PX = 24, 144
@@ -50,6 +57,8 @@ class Comparison:
         steps, batch: of a run.
         train_crops, validation_crops: how many are made.
         crops: how they are drawn.
+        rendered: dataset folder on whose instances the networks are also measured, those that are mostly visible; of
+            networks for upright parts those that stand upright.
     """
 
     models: Path
@@ -61,6 +70,7 @@ class Comparison:
     train_crops: int = 12_000
     validation_crops: int = 1200
     crops: CropSettings = field(default_factory=CropSettings)
+    rendered: Path | None = None
 
     def __post_init__(self) -> None:
         for name in ("seeds", "steps", "batch", "train_crops", "validation_crops"):
@@ -202,30 +212,88 @@ def train_crops(
 
     schedule = Schedule(comparison.steps, log_every=max(1, comparison.steps // 15))
     records = list(fit(net, losses, schedule, measure=measure))
-    net.eval()
-    with torch.no_grad():
-        output = net(held_out.pixels).of_class(held_out.classes)
-        chosen, index = output.chosen(held_out.counts)
-    of_responsible = output.corners[torch.arange(len(validation)), held_out.index].numpy()
-    size = comparison.crops.size_px
-    corners_px = chosen.numpy().astype(np.float64) * size + (size - 1) / 2
-    angles = _angles_deg(corners_px, validation, table, boxes)
-    targets = LabelMaker(labels, table)(validation.obj_ids, validation.R_m2c, validation.t_m2c)
-    measured = _Measured(
-        of_responsible, held_out.corners.numpy(), (index == held_out.index).numpy(), angles, validation.obj_ids
-    )
-    rows = {"all": measured.row(np.ones(len(validation), dtype=bool))}
-    for obj_id in sorted(models):
-        mine = validation.obj_ids == obj_id
-        rows[f"object {obj_id}"] = measured.row(mine)
-        for low, high in _ELEVATIONS_DEG:
-            inside = (validation.elevation_deg >= low) & (validation.elevation_deg < high)
-            if (mine & inside).any():
-                rows[f"object {obj_id}, elevation {max(low, -90):g} to {high:.3g}"] = measured.row(mine & inside)
-    for low, high in _MARGINS_DEG:
-        if (inside := (targets.margin_deg >= low) & (targets.margin_deg < high)).any():
-            rows[f"margin {low:g} to {high:.4g}"] = measured.row(inside)
+    judge = _Judge(net, batcher, LabelMaker(labels, table), table, boxes)
+    rows, corners_px = judge.rows(validation)
+    if comparison.rendered is not None:
+        on_renders, _ = judge.rows(rendered_crops(comparison))
+        rows |= {f"rendered, {name}": row for name, row in on_renders.items()}
     return Trained(Run(labels, seed, records, rows), net, corners_px)
+
+
+@dataclass(frozen=True, eq=False)
+class _Judge:
+    """Measures a network on crops."""
+
+    net: CropNet
+    batcher: CropBatcher
+    maker: LabelMaker
+    table: SymmetryTable
+    boxes_mm: Mapping[int, Floats]
+
+    def rows(self, crops: Crops) -> tuple[dict[str, Row], Floats]:
+        """What it reaches on all crops, by object, elevation and margin; and its corners (N, 8, 2), pixels."""
+        batch, size = self.batcher.batch(crops), crops.pixels.shape[1]
+        self.net.eval()
+        with torch.no_grad():
+            output = self.net(batch.pixels).of_class(batch.classes)
+        chosen, index = output.chosen(batch.counts)
+        responsible = output.corners[torch.arange(len(crops)), batch.index].numpy()
+        corners_px = chosen.numpy().astype(np.float64) * size + (size - 1) / 2
+        measured = _Measured(
+            responsible,
+            batch.corners.numpy(),
+            (index == batch.index).numpy(),
+            _angles_deg(corners_px, crops, self.table, self.boxes_mm),
+            crops.obj_ids,
+        )
+        margins = self.maker(crops.obj_ids, crops.R_m2c, crops.t_m2c).margin_deg
+        return {name: measured.row(rows) for name, rows in _groups(crops, margins)}, corners_px
+
+
+def _groups(crops: Crops, margins_deg: Floats) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Names of rows, and which crops they are of; empty ones are left out."""
+    yield "all", np.ones(len(crops), dtype=bool)
+    for obj_id in np.unique(crops.obj_ids):
+        mine = crops.obj_ids == obj_id
+        yield f"object {obj_id}", mine
+        for low, high in _ELEVATIONS_DEG:
+            inside = mine & (crops.elevation_deg >= low) & (crops.elevation_deg < high)
+            if inside.any():
+                yield f"object {obj_id}, elevation {low:g} to {high:.3g}", inside
+    for low, high in _MARGINS_DEG:
+        inside = (margins_deg >= low) & (margins_deg < high)
+        if inside.any():
+            yield f"margin {low:g} to {high:.4g}", inside
+
+
+def rendered_crops(comparison: Comparison) -> Crops:
+    """Crops of the dataset ``comparison.rendered``, as virtual cameras that look straight at the parts see them.
+
+    Raises:
+        UserError: none of its instances can be used.
+    """
+    assert comparison.rendered is not None
+    dataset = Dataset.open(comparison.rendered)
+    parts = []
+    for image in dataset:
+        sample = sample_of(image)
+        if image.R_w2c is None:
+            raise UserError(
+                f"{dataset.root}: does not say where the table is (cam_R_w2c); whether parts stand is unknown"
+            )
+        up = image.R_w2c[:, 2]
+        axis = sample.R_m2c[:, :, 2]
+        wanted = np.isin(sample.obj_ids, comparison.objects)
+        if comparison.crops.poses == "upright":
+            wanted &= axis @ up > np.cos(np.radians(_UPRIGHT_DEG))
+        to_camera = -sample.t_m2c / np.linalg.norm(sample.t_m2c, axis=1, keepdims=True)
+        elevation = np.degrees(np.arcsin(np.clip(to_camera @ up, -1, 1)))
+        own = crops_of(sample, comparison.crops.size_px, min_visib_fract=_VISIBLE, elevation=elevation, wanted=wanted)
+        if len(own):
+            parts.append(own)
+    if not parts:
+        raise UserError(f"{dataset.root}: has no instance of the objects that is visible enough and stands as needed")
+    return Crops.concatenate(parts)
 
 
 def batch_losses(net: CropNet, pixels: torch.Tensor, batch: Any) -> Mapping[str, torch.Tensor]:
@@ -350,7 +418,11 @@ def write_comparison_page(comparison: Comparison, runs: Sequence[Run], out: Path
         steps = [float(record["step"]) for record in of_set[0]]
         curves[labels] = (steps, np.mean([[record["val_l1"] for record in log] for log in of_set], axis=0).tolist())
     sections.append(Section("Corner L1 on validation crops", svg=line_chart(curves, "step", "L1 / side", True)))
-    names = sorted({name for run in runs for name in run.rows} - {"all"}, key=_in_order)
+    if comparison.rendered is not None:
+        count = runs[0].rows["rendered, all"].crops
+        text = f"{count} crops of {comparison.rendered.name}; none of its images was learned from."
+        sections.append(Section("On rendered images", text, COLUMNS, table_rows(runs, sets, "rendered, all")))
+    names = sorted({name for run in runs for name in run.rows} - {"all", "rendered, all"}, key=_in_order)
     columns = ("recall at 10 degrees", *sets)
     recalls = [
         (name, *(_cell([row.recalls[1] for row in _of(runs, labels, name)], ".0%") for labels in sets))
@@ -368,5 +440,5 @@ def write_comparison_page(comparison: Comparison, runs: Sequence[Run], out: Path
 
 
 def _in_order(name: str) -> tuple[str, list[float]]:
-    kind = name.partition(" ")[0]
+    kind = re.sub(r"[-\d.,]+", "", name)
     return kind, [float(word) for word in name.replace(",", "").split() if word.lstrip("-").replace(".", "").isdigit()]

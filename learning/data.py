@@ -230,7 +230,12 @@ def picture(pixels: NDArray[np.uint8], rng: np.random.Generator | None, brightne
 
 
 def crops_of(
-    sample: Sample, size_px: int, zoom: float = 1.2, min_visib_fract: float = 0.6, elevation: Floats | None = None
+    sample: Sample,
+    size_px: int,
+    zoom: float = 1.2,
+    min_visib_fract: float = 0.6,
+    elevation: Floats | None = None,
+    wanted: NDArray[np.bool_] | None = None,
 ) -> Crops:
     """What virtual cameras that look straight at the instances' boxes see, with the poses turned along: exact.
 
@@ -240,8 +245,10 @@ def crops_of(
         zoom: side of a crop over the longer side of its box.
         min_visib_fract: instances of which less is visible are left out.
         elevation: (N,) degrees, if known.
+        wanted: (N,) which instances; all if None.
     """
-    rows = np.flatnonzero(sample.visib_fract >= min_visib_fract)
+    visible = sample.visib_fract >= min_visib_fract
+    rows = np.flatnonzero(visible if wanted is None else visible & wanted)
     boxes = sample.boxes[rows]
     centres = (boxes[:, :2] + boxes[:, 2:]) / 2
     Q = looking_at(centres, sample.K)

@@ -70,6 +70,9 @@ def compare_command(
     poses: Annotated[
         Literal["upright", "any"], typer.Option(help="upright: parts that stand on a table; any: every rotation.")
     ] = "upright",
+    rendered: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Dataset of the same parts to measure the networks on, too.")
+    ] = None,
     workers: Workers = None,
 ) -> None:
     """Prove what the labels are worth.
@@ -91,9 +94,12 @@ def compare_command(
         train_crops=crops,
         validation_crops=crops // 10,
         crops=CropSettings(poses=poses),
+        rendered=rendered,
     )
     runs = compare(comparison, out, workers)
     rows = [COLUMNS, *table_rows(runs, comparison.labels)]
+    if rendered is not None:
+        rows += [("rendered:", *[""] * (len(COLUMNS) - 1)), *table_rows(runs, comparison.labels, "rendered, all")]
     widths = [max(len(row[i]) for row in rows) for i in range(len(COLUMNS))]
     for row in rows:
         say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())

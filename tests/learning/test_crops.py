@@ -17,10 +17,11 @@ from packages import package_or_skip
 
 torch = package_or_skip("torch", "extra 'learn' has it")
 
+from synthetless.dataset import Dataset  # noqa: E402
 from synthetless.errors import UserError  # noqa: E402
 from synthetless.io.models import load_models  # noqa: E402
 from synthetless.learning import fit as fitting  # noqa: E402
-from synthetless.learning.compare import Comparison, compare, train_crops  # noqa: E402
+from synthetless.learning.compare import Comparison, compare, rendered_crops, train_crops  # noqa: E402
 from synthetless.learning.crops import CropBatcher, CropNet, _turn  # noqa: E402
 from synthetless.learning.heads import PoseHead, existing, pose_losses  # noqa: E402
 from synthetless.learning.solve import solve_pose  # noqa: E402
@@ -161,6 +162,22 @@ def test_a_small_comparison_writes_its_page(builtin_models: Path, tmp_path: Path
     kept = json.loads((tmp_path / "out" / "runs.json").read_text())
     assert kept["atlas 0"]["rows"]["all"]["crops"] == 12
     assert compare(comparison, tmp_path / "again", workers=1)[1].rows == runs[1].rows
+
+
+def test_a_comparison_is_measured_on_a_dataset_too(valid: Path, tmp_path: Path) -> None:
+    """Crops of the dataset's instances, in rows of their own."""
+    crops = CropSettings(poses="any")
+    comparison = Comparison(valid / "models", (2, 3), ("map",), 1, 2, 8, 12, 8, crops, rendered=valid)
+    (run,) = compare(comparison, tmp_path / "out", workers=1)
+    assert run.rows["rendered, all"].crops == sum(
+        n.obj_id in (2, 3) and n.visibility is not None and n.visibility.visib_fract >= 0.6
+        for image in Dataset.open(valid)
+        for n in image.instances
+    )
+    assert "On rendered images" in (tmp_path / "out" / "index.html").read_text()
+    upright = Comparison(valid / "models", (2, 3), ("map",), rendered=valid)
+    with pytest.raises(UserError, match="no instance of the objects that is visible enough and stands as needed"):
+        rendered_crops(upright)  # they lie in any pose
 
 
 def test_wrong_comparisons_are_one_line(builtin_models: Path, tmp_path: Path) -> None:
