@@ -59,6 +59,7 @@ class Comparison:
         crops: how they are drawn.
         rendered: dataset folder on whose instances the networks are also measured, those that are mostly visible; of
             networks for upright parts those that stand upright.
+        full_weight_deg: weight the corners' loss by the margin, which counts in full from here on; None does not.
     """
 
     models: Path
@@ -71,6 +72,7 @@ class Comparison:
     validation_crops: int = 1200
     crops: CropSettings = field(default_factory=CropSettings)
     rendered: Path | None = None
+    full_weight_deg: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("seeds", "steps", "batch", "train_crops", "validation_crops"):
@@ -205,7 +207,7 @@ def train_crops(
         rng = np.random.default_rng([seed, 3, step])
         rows = rng.integers(0, len(train), comparison.batch)
         batch = batcher.augmented(train.take(rows), rng, roll_deg)
-        return batch.losses(net(batch.pixels))
+        return batch.losses(net(batch.pixels), comparison.full_weight_deg)
 
     def measure() -> Mapping[str, float]:
         return {"val_l1": float(batch_losses(net, held_out.pixels, held_out)["corners"])}

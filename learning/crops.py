@@ -58,6 +58,7 @@ class CropBatch:
         classes: (N,) number of the object among the sorted ids.
         corners: (N, 8, 2) relative to the crop's centre, in its side.
         index, counts: (N,) responsible regressor, and how many there are.
+        margin_deg: (N,) discontinuity margins of the labels.
     """
 
     pixels: Tensor
@@ -65,14 +66,16 @@ class CropBatch:
     corners: Tensor
     index: Tensor
     counts: Tensor
+    margin_deg: Tensor
 
-    def losses(self, output: PoseOutput) -> dict[str, Tensor]:
-        """Of the network's output."""
-        return pose_losses(output.of_class(self.classes), self.corners, self.index, self.counts)
+    def losses(self, output: PoseOutput, full_weight_deg: float | None = None) -> dict[str, Tensor]:
+        """Of the network's output; labels nearer to a jump than ``full_weight_deg`` count for less, if it is given."""
+        weights = None if full_weight_deg is None else (self.margin_deg / full_weight_deg).clamp(max=1)
+        return pose_losses(output.of_class(self.classes), self.corners, self.index, self.counts, weights)
 
     def to(self, device: torch.device) -> CropBatch:
         """The same elsewhere."""
-        parts = (self.pixels, self.classes, self.corners, self.index, self.counts)
+        parts = (self.pixels, self.classes, self.corners, self.index, self.counts, self.margin_deg)
         return CropBatch(*(part.to(device) for part in parts))
 
 
@@ -104,6 +107,7 @@ class CropBatcher:
             torch.from_numpy(corners).float(),
             torch.from_numpy(targets.regressor_index),
             torch.from_numpy(targets.n_regressors),
+            torch.from_numpy(targets.margin_deg).float(),
         )
 
     def augmented(self, crops: Crops, rng: np.random.Generator, roll_deg: float) -> CropBatch:

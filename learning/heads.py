@@ -59,7 +59,9 @@ def existing(logits: Tensor, counts: Tensor) -> Tensor:
     return logits.masked_fill(beyond, -torch.inf)
 
 
-def pose_losses(output: PoseOutput, corners: Tensor, index: Tensor, counts: Tensor) -> dict[str, Tensor]:
+def pose_losses(
+    output: PoseOutput, corners: Tensor, index: Tensor, counts: Tensor, weights: Tensor | None = None
+) -> dict[str, Tensor]:
     """Losses of outputs of one class: L1 of the responsible regressors, and the classifier's.
 
     Args:
@@ -67,12 +69,15 @@ def pose_losses(output: PoseOutput, corners: Tensor, index: Tensor, counts: Tens
         corners: (N, 8, 2) true corners, in box units.
         index: (N,) responsible regressors; the others get no gradient.
         counts: (N,) how many regressors each object has.
+        weights: (N,) of the corners' losses; equal if None.
     """
     if len(index) == 0:  # of an image without instances: no gradient, and no NaN
         nothing = output.corners.sum() * 0
         return {"corners": nothing, "index": nothing}
     responsible = output.corners[torch.arange(len(index), device=index.device), index]
+    distances = (responsible - corners).abs().mean(dim=(1, 2))
+    share = torch.ones_like(distances) if weights is None else weights
     return {
-        "corners": functional.l1_loss(responsible, corners),
+        "corners": (share * distances).sum() / share.sum().clamp(min=1e-6),
         "index": INDEX_WEIGHT * functional.cross_entropy(existing(output.logits, counts), index),
     }

@@ -70,6 +70,10 @@ def compare_command(
     poses: Annotated[
         Literal["upright", "any"], typer.Option(help="upright: parts that stand on a table; any: every rotation.")
     ] = "upright",
+    margin_weight: Annotated[
+        float | None,
+        typer.Option(metavar="DEGREES", help="Weight the loss by the margin, which counts in full from here on."),
+    ] = None,
     rendered: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Dataset of the same parts to measure the networks on, too.")
     ] = None,
@@ -95,6 +99,7 @@ def compare_command(
         validation_crops=crops // 10,
         crops=CropSettings(poses=poses),
         rendered=rendered,
+        full_weight_deg=margin_weight,
     )
     runs = compare(comparison, out, workers)
     rows = [COLUMNS, *table_rows(runs, comparison.labels)]

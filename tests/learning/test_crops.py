@@ -120,6 +120,18 @@ def test_only_the_responsible_regressor_learns() -> None:
     assert [loss.item() for loss in empty.values()] == [0, 0]
 
 
+def test_labels_near_a_jump_can_count_for_less() -> None:
+    output = PoseHead(6, 1, 1)(torch.randn(3, 6)).of_class(torch.zeros(3, dtype=torch.int64))
+    corners, index, counts = torch.randn(3, 8, 2), torch.zeros(3, dtype=torch.int64), torch.ones(3, dtype=torch.int64)
+    distances = (output.corners[:, 0] - corners).abs().mean(dim=(1, 2))
+    for weights in ([1.0, 1, 1], [0, 0.5, 1], [0, 0, 0]):
+        found = pose_losses(output, corners, index, counts, torch.tensor(weights))["corners"].item()
+        expected = np.average(distances.detach().numpy(), weights=weights) if any(weights) else 0
+        assert found == pytest.approx(expected, abs=1e-6)
+    equal = pose_losses(output, corners, index, counts)["corners"].item()
+    assert equal == pytest.approx(distances.mean().item(), abs=1e-6)
+
+
 def test_corners_of_a_label_are_solved_to_its_pose(stream: CropStream, models: Any, table: SymmetryTable) -> None:
     crops = stream.crops(0, 24)
     corners = _batcher(models, table, "true").batch(crops).corners.numpy().astype(float) * 48 + 23.5
