@@ -27,7 +27,7 @@ PHASES = {
     "physics": [("physics.py", "settle"), ("drop.py", "_collider")],
     "build": [("render.py", "scene")],
     "annotate": [("raycast.py", "annotate")],
-    "develop": [("color.py", "exposure_gain"), ("color.py", "tonemap")],
+    "develop": [("color.py", "exposure_gain"), ("color.py", "picture")],
     "encode": [("store.py", "_encode")],
     "commit": [("store.py", "commit")],
 }

@@ -86,6 +86,8 @@ def _images(dataset: Path, recipe: Recipe) -> list[FinishedImage]:
     cameras, gts = records.read_scene_json(scene.scene_camera), records.read_scene_json(scene.scene_gt)
     infos, specs = records.read_scene_json(scene.scene_gt_info), read_json_lines(scene.scene_spec)
     annotations = read_json(scene.scene_gt_coco)["annotations"]
+    for annotation in annotations:
+        del annotation["id"]
     return [
         FinishedImage(
             plan_image(im_id, recipe.camera.views_per_drop),

@@ -17,11 +17,14 @@ from pydantic import Field, ValidationError
 
 from synthetless.errors import UserError
 from synthetless.io.documents import parse_document, read_document, shown
-from synthetless.scenes.settings import Bounds, SceneSettings, Settings
+from synthetless.scenes.settings import SENSORS, Bounds, SceneSettings, SensorSettings, Settings
 from synthetless.scenes.spec import Intrinsics
 
 BUILTIN = "builtin"
 Tree = TypeVar("Tree", bound=Settings)
+SPLIT = "train_synthetless"
+"""The folder of scenes, if a recipe names no other."""
+
 Output = Literal["rgb", "depth", "masks", "normals", "object_coordinates", "exr"]
 
 
@@ -71,7 +74,7 @@ class Recipe(SceneSettings):
 
     name: str = "synthetless"
     """Name of the dataset, recorded with it."""
-    split: Annotated[str, Field(pattern=r"^[A-Za-z0-9_]+$")] = "train_synthetless"
+    split: Annotated[str, Field(pattern=r"^[A-Za-z0-9_]+$")] = SPLIT
     """Name of the split's folder."""
     images: Annotated[int, Bounds(1, 100_000_000, "images")] = 30000
     """How many images to make."""
@@ -114,8 +117,19 @@ def load_settings(kind: type[Tree], path: Path | None, overrides: Sequence[str] 
     Raises:
         RecipeError: unreadable file, no mapping, unknown key, value of the wrong kind or outside its range.
     """
-    tree: dict[str, Any] = {} if path is None else _read_recipe(path)
-    origin = "recipe" if path is None else str(path)
+    return _parse(kind, {} if path is None else _read_recipe(path), overrides, "recipe" if path is None else str(path))
+
+
+def parse_recipe(tree: dict[str, Any], overrides: Sequence[str] = (), origin: str = "recipe") -> Recipe:
+    """A recipe from a tree of plain values, which the overrides change; ``origin`` is what an error calls it.
+
+    Raises:
+        RecipeError: as in ``load_recipe``.
+    """
+    return _parse(Recipe, tree, overrides, origin)
+
+
+def _parse(kind: type[Tree], tree: dict[str, Any], overrides: Sequence[str], origin: str) -> Tree:
     for override in overrides:
         _apply(tree, override)
     try:
@@ -134,9 +148,9 @@ def settings(group: type[Settings] = Recipe, prefix: str = "") -> Iterator[Setti
     inner: list[tuple[str, type[Settings]]] = []
     for name, field in group.model_fields.items():
         key, kind = f"{prefix}{name}", field.annotation
-        if isinstance(kind, type) and issubclass(kind, Settings):
-            inner.append((key, kind))
-        else:
+        groups = [item for item in (kind, *get_args(kind)) if isinstance(item, type) and issubclass(item, Settings)]
+        inner += [(key, item) for item in groups]
+        if kind not in groups:
             yield Setting(
                 key, _kind(kind, field.metadata), field.get_default(), " ".join((field.description or "").split())
             )
@@ -167,6 +181,9 @@ def _apply(tree: dict[str, Any], override: str) -> None:
         value = parse_document(text, shown(text))
     except UserError as error:
         raise RecipeError(f"--set {key}: {error}") from None
+    named = tree.get("sensor")
+    if path[0] == "sensor" and len(path) > 1 and (named is None or isinstance(named, str)):
+        tree["sensor"] = {} if named in (None, "none") else {"preset": named}
     node = tree
     for name in path[:-1]:
         child = node.setdefault(name, {})
@@ -203,6 +220,8 @@ def _kind(annotation: Any, metadata: Sequence[Any]) -> str:
     """How the value is written: choices, range or number with its bounds and unit."""
     bounds = next((str(item) for item in metadata if isinstance(item, Bounds)), "")
     arguments = get_args(annotation)
+    if SensorSettings in arguments:
+        return " | ".join(["none", *SENSORS])
     if arguments and all(isinstance(item, str) for item in arguments):
         return " | ".join(arguments)
     if len(arguments) == 2 and arguments[0] is arguments[1] and Ellipsis not in arguments:

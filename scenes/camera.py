@@ -39,6 +39,19 @@ def extrinsics(view: View, centre_m: ArrayLike) -> tuple[NDArray[np.float64], ND
     return R_w2c, -R_w2c @ position
 
 
+def finest_pixel_m(R_w2c: NDArray[np.float64], t_w2c_m: NDArray[np.float64], intrinsics: Intrinsics) -> float:
+    """Side of the smallest patch, facing the camera, that a pixel sees of the table; infinite if it sees none of it.
+
+    The patch is z / f wide at depth z, and of all pixels that see the table one in a corner is nearest to it.
+    """
+    u, v = (np.array([-0.5, side - 0.5]) for side in (intrinsics.width, intrinsics.height))
+    x, y = (u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy
+    rays = np.stack([*np.meshgrid(x, y), np.ones((2, 2))], axis=-1).reshape(4, 3) @ R_w2c
+    height_m = float(-R_w2c[:, 2] @ t_w2c_m)
+    steepest = float(-rays[:, 2].min())
+    return height_m / steepest / max(intrinsics.fx, intrinsics.fy) if steepest > 0 else math.inf
+
+
 def settled_centre(settled: Sequence[Pose]) -> NDArray[np.float64]:
     """(3,) mean of the positions of objects at rest, metres: the point that a view's aim is offset from."""
     mean: NDArray[np.float64] = np.array([pose.position_m for pose in settled], dtype=np.float64).mean(axis=0)

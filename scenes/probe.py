@@ -38,7 +38,7 @@ def render() -> dict[str, Any]:
     spec = sample_scene(settings, Catalogue({1: 0.06}, {}, ()), seed=0, drop=0)
     hovering = [Pose(item.release.rotation_wxyz, (0.06 * (k - 2), 0.0, 0.04)) for k, item in enumerate(spec.objects)]
     intrinsics = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    session = BlenderSession({("model", 1): mesh}, intrinsics, settings.render, settings.table.size_m)
+    session = BlenderSession({("model", 1): mesh}, intrinsics, settings.render, settings.table)
     began = time.perf_counter()
     with session.scene(spec, hovering) as scene:
         image = scene.render(0)

@@ -7,7 +7,7 @@ import math
 import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,9 @@ from synthetless.errors import UserError
 from synthetless.scenes import blender, camera, lights, materials
 from synthetless.scenes.blender import RenderDevice
 from synthetless.scenes.rotations import matrix
-from synthetless.scenes.settings import RenderSettings
+from synthetless.scenes.settings import RenderSettings, TableSettings
 from synthetless.scenes.spec import Intrinsics, Mesh, Pose, Role, SceneSpec
-from synthetless.scenes.textures import PhotoTexture, load_photo, procedural_image
+from synthetless.scenes.textures import PhotoTexture, load_photo, procedural_image, seamless
 
 _CREASE_DEG = 30.0
 """Edges sharper than this are shaded as edges."""
@@ -34,7 +34,7 @@ class BlenderSession:
         meshes: every model that may appear, by role and object id.
         intrinsics: of the camera.
         settings: of the renderer.
-        table_size_m: side of the table.
+        table: its size, and how photographs are repeated on it.
         photos: folder of the photographs, None if only built-in textures are used.
         threads: of the renderer; 0 uses every core.
         device: what to render on.
@@ -44,7 +44,7 @@ class BlenderSession:
     meshes: Mapping[tuple[Role, int], Mesh]
     intrinsics: Intrinsics
     settings: RenderSettings
-    table_size_m: float
+    table: TableSettings
     photos: Path | None = None
     threads: int = 0
     device: RenderDevice = blender.CPU
@@ -76,7 +76,7 @@ class BlenderSession:
         try:
             lights.add_ambient(self.bpy, bpy_scene, spec.ambient)
             lights.add_lamp(self.bpy, collection, spec.light, centre_m)
-            self._add_table(collection, spec)
+            self._add_table(collection, spec, centre_m)
             for number, (item, pose) in enumerate(zip(spec.objects, settled, strict=True)):
                 placed = self.bpy.data.objects.new(f"object {number}", self._mesh(item.role, item.obj_id))
                 placed.matrix_world = _transform(pose)
@@ -92,19 +92,30 @@ class BlenderSession:
         finally:
             blender.clear(self.bpy, keep=set(self._loaded.values()))
 
-    def _add_table(self, collection: Any, spec: SceneSpec) -> None:
-        texture = spec.plane.texture
+    def _add_table(self, collection: Any, spec: SceneSpec, centre_m: NDArray[np.float64]) -> None:
+        plane, texture = spec.plane, spec.plane.texture
+        is_seamless = True
         if isinstance(texture, PhotoTexture):
             if self.photos is None:
                 raise UserError(f"the scene needs the photograph {texture.file}, but no textures folder is given")
             pixels = load_photo(self.photos, texture.file)
+            is_seamless = self.table.photos == "seamless"
+            if is_seamless:
+                texel_m = self._texel_m(spec, centre_m, len(pixels))
+                pixels = seamless(pixels)
+                plane = replace(plane, tile_m=texel_m * len(pixels))
         else:
             pixels = procedural_image(texture)
         image = materials.new_image(self.bpy, pixels)
-        seamless = not isinstance(texture, PhotoTexture)
-        material = materials.textured(self.bpy, spec.plane, image, seamless)
+        material = materials.textured(self.bpy, plane, image, is_seamless)
         aspect = pixels.shape[1] / pixels.shape[0]
-        materials.add_table(self.bpy, collection, spec.plane, self.table_size_m, material, aspect)
+        materials.add_table(self.bpy, collection, plane, self.table.size_m, material, aspect)
+
+    def _texel_m(self, spec: SceneSpec, centre_m: NDArray[np.float64], rows: int) -> float:
+        """Side of a texel of a photograph: as the tile was drawn, or no larger than a pixel where the recipe allows."""
+        poses = (camera.extrinsics(view, centre_m) for view in spec.views)
+        pixel_m = min(camera.finest_pixel_m(*pose, self.intrinsics) for pose in poses)
+        return max(self.table.tile_m[0] / rows, min(spec.plane.tile_m / rows, pixel_m))
 
     def _mesh(self, role: Role, obj_id: int) -> Any:
         key = (role, obj_id)

@@ -21,6 +21,7 @@ from synthetless.scenes.settings import (
     ObjectSettings,
     ReleaseSettings,
     SceneSettings,
+    SensorSettings,
     TableSettings,
 )
 from synthetless.scenes.spec import (
@@ -32,6 +33,7 @@ from synthetless.scenes.spec import (
     Pose,
     Role,
     SceneSpec,
+    SensorSpec,
     View,
 )
 from synthetless.scenes.srgb import linear_from_srgb
@@ -50,6 +52,7 @@ class Stream(IntEnum):
     PLANE = 3
     LIGHT = 4
     VIEWS = 5
+    SENSOR = 6
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,7 @@ def sample_scene(settings: SceneSettings, catalogue: Catalogue, seed: int, drop:
     """
 
     def stream(purpose: Stream, *further: int) -> np.random.Generator:
-        return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(drop, purpose, *further)))
+        return _stream(seed, drop, purpose, *further)
 
     chosen = _choose_objects(settings.objects, catalogue, stream(Stream.OBJECTS))
     materials = stream(Stream.MATERIALS)
@@ -100,8 +103,43 @@ def sample_scene(settings: SceneSettings, catalogue: Catalogue, seed: int, drop:
     return SceneSpec(drop, attempt, objects, plane, light, ambient, views)
 
 
+def sample_sensor(settings: SensorSettings, seed: int, drop: int, view: int) -> SensorSpec:
+    """Draw the camera of one image; arguments as for ``sample_scene``, and the view of the drop."""
+    return draw_sensor(settings, _stream(seed, drop, Stream.SENSOR, view, settings.variant))
+
+
+def draw_sensor(settings: SensorSettings, rng: np.random.Generator) -> SensorSpec:
+    """Draw a camera."""
+    was_jpeg = float(rng.uniform()) < settings.jpeg_share
+    quality = int(rng.integers(*settings.jpeg_quality, endpoint=True))
+    return SensorSpec(
+        blur_px=_uniform(rng, settings.blur_px),
+        vignetting=_uniform(rng, settings.vignetting),
+        exposure_ev=_uniform(rng, settings.exposure_ev),
+        shoulder=_uniform(rng, settings.shoulder),
+        photons=_log_uniform(rng, settings.photons),
+        read_noise=_uniform(rng, settings.read_noise),
+        red_gain=_log_uniform(rng, settings.red_gain),
+        blue_gain=_log_uniform(rng, settings.blue_gain),
+        chroma_px=_uniform(rng, settings.chroma_px),
+        sharpen=_uniform(rng, settings.sharpen),
+        sharpen_px=_uniform(rng, settings.sharpen_px),
+        jpeg_quality=quality if was_jpeg else None,
+        noise_seed=int(rng.integers(2**32)),
+    )
+
+
+def _stream(seed: int, drop: int, purpose: Stream, *further: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(drop, purpose, *further)))
+
+
 def _uniform(rng: np.random.Generator, bounds: FloatRange) -> float:
     return float(rng.uniform(*bounds))
+
+
+def _log_uniform(rng: np.random.Generator, bounds: FloatRange) -> float:
+    low, high = bounds
+    return float(math.exp(rng.uniform(math.log(low), math.log(high))))
 
 
 def _choose_objects(settings: ObjectSettings, catalogue: Catalogue, rng: np.random.Generator) -> list[tuple[Role, int]]:
@@ -136,10 +174,9 @@ def _release(settings: ReleaseSettings, diameters_m: Sequence[float], rng: np.ra
 
 
 def _plane(settings: TableSettings, photos: Sequence[str], rng: np.random.Generator) -> PlaneSpec:
-    low, high = settings.tile_m
     return PlaneSpec(
         texture=sample_texture(rng, photos),
-        tile_m=float(math.exp(rng.uniform(math.log(low), math.log(high)))),
+        tile_m=_log_uniform(rng, settings.tile_m),
         rotation_deg=float(rng.uniform(0, 360)),
         shift=(float(rng.uniform()), float(rng.uniform())),
         roughness=_uniform(rng, settings.roughness),

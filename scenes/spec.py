@@ -126,6 +126,39 @@ class SceneSpec:
 
 
 @dataclass(frozen=True)
+class SensorSpec:
+    """A colour camera, as it was for one image; what each value does is in ``scenes/sensor.py``.
+
+    Attributes:
+        blur_px: standard deviation of the point spread.
+        vignetting: share of the light that the corners lose.
+        exposure_ev: stops that the image is over-exposed by.
+        shoulder: upper part of the range over which highlights roll off.
+        photons: that a pixel counts at full scale.
+        read_noise: standard deviation, of full scale.
+        red_gain, blue_gain: of the white balance, relative to green.
+        chroma_px: standard deviation of the blur of the colour differences.
+        sharpen, sharpen_px: amount of the unsharp masking, and standard deviation of its blur.
+        jpeg_quality: of the compression inside the camera; None if there is none.
+        noise_seed: of the photon and read noise.
+    """
+
+    blur_px: float
+    vignetting: float
+    exposure_ev: float
+    shoulder: float
+    photons: float
+    read_noise: float
+    red_gain: float
+    blue_gain: float
+    chroma_px: float
+    sharpen: float
+    sharpen_px: float
+    jpeg_quality: int | None
+    noise_seed: int
+
+
+@dataclass(frozen=True)
 class Intrinsics:
     """A pinhole camera without skew: image size, focal lengths and principal point, all in pixels.
 

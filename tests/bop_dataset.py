@@ -16,7 +16,7 @@ from synthetless.annotation.instances import ImageAnnotation, PosedModel
 from synthetless.annotation.raycast import RayCaster
 from synthetless.dataset import records
 from synthetless.dataset.layout import CAMERA_FILE, ScenePaths
-from synthetless.dataset.records import Entry
+from synthetless.dataset.records import CanonicalEntry, CocoAnnotation
 from synthetless.io import images
 from synthetless.io.files import atomic_write, write_json
 from synthetless.scenes.spec import Intrinsics
@@ -44,7 +44,7 @@ def _poses(generator: np.random.Generator, count: int) -> list[PosedModel]:
     return [PosedModel(int(o), R, np.asarray(t)) for o, R, t in zip(obj_ids, rotations, places, strict=True)]
 
 
-def _canonical(posed: PosedModel, index: int) -> Entry:
+def _canonical(posed: PosedModel, index: int) -> CanonicalEntry:
     """A label of the right form; what is in it does not matter to the formats."""
     corners = np.array([[x, y, z] for x in (-20, 20) for y in (-15, 15) for z in (-10, 10)])
     pixels = (corners @ posed.R_m2c.T + posed.t_m2c) @ records.camera_matrix(CAMERA).T
@@ -70,7 +70,7 @@ def _write_image(scene: ScenePaths, im_id: int, seen: ImageAnnotation, rgb: NDAr
 
 def _write_scene(scene: ScenePaths, caster: RayCaster, generator: np.random.Generator, extension: str) -> None:
     entries: dict[str, dict[int, Any]] = {name: {} for name in ("camera", "gt", "info", "canonical")}
-    coco: list[Entry] = []
+    coco: list[CocoAnnotation] = []
     camera = records.camera_entry(records.camera_matrix(CAMERA), np.eye(3), np.array([0.0, 0.0, 600.0]), DEPTH_SCALE)
     for im_id in range(IMAGES):
         last = scene.root.name == f"{SCENES:06d}" and im_id == IMAGES - 1

@@ -15,7 +15,7 @@ The photographs are CC0 ones of ambientCG and Poly Haven; the models are those o
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import repeat
 from pathlib import Path
 
@@ -23,14 +23,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetless.dataset import records
+from synthetless.dataset import Dataset
 from synthetless.dataset.labels import box_corners_mm
-from synthetless.dataset.layout import ScenePaths, find_split
-from synthetless.dataset.records import Entry
+from synthetless.dataset.records import ModelInfo
 from synthetless.dataset.sheet import class_color
 from synthetless.io import images
 from synthetless.io.files import atomic_write, read_bytes
-from synthetless.io.models import read_models_info
 from synthetless.preview.image import Segment, axis_lines, box_lines
 
 IMAGES = Path(__file__).resolve().parents[1] / "images"
@@ -45,22 +43,17 @@ Color = tuple[int, int, int]
 
 def overlay(dataset: Path, im_id: int) -> Picture:
     """The image cut to its objects, twice: left masks and true poses, right masks and canonical poses."""
-    scene = ScenePaths.of(dataset, 1, find_split(dataset))
-    path = next(path for path in (scene.rgb(im_id, "png"), scene.rgb(im_id, "jpg")) if path.exists())
-    rgb = images.decode_rgb(read_bytes(path), path)
-    truth = records.read_scene_json(scene.scene_gt)[im_id]
-    canonical = records.read_scene_json(scene.scene_gt_canonical)[im_id]
-    K = np.array(records.read_scene_json(scene.scene_camera)[im_id]["cam_K"]).reshape(3, 3)
-    infos = read_models_info(dataset / "models")
-    paths = [scene.mask_visib(im_id, gt_id) for gt_id in range(len(truth))]
-    masks = [images.decode_mask(read_bytes(path), path) for path in paths]
+    source = Dataset.open(dataset)
+    image = source.image(1, im_id)
+    rgb, infos = image.rgb(), source.models_info
+    masks = [instance.mask_visib() for instance in image.instances]
     poses = (
-        [(gt["obj_id"], gt["cam_R_m2c"], gt["cam_t_m2c"]) for gt in truth],
-        [(entry["obj_id"], entry["cam_R_m2c_canonical"], entry["cam_t_m2c_canonical"]) for entry in canonical],
+        [(instance.obj_id, instance.R_m2c, instance.t_m2c) for instance in image.instances],
+        [(each.obj_id, each.label.R_m2c, each.label.t_m2c) for each in image.instances if each.label is not None],
     )
     left, top, right, bottom = window(np.any(masks, axis=0))
     panels = [
-        draw(rgb, masks, of, K, infos)[SCALE * top : SCALE * bottom, SCALE * left : SCALE * right] for of in poses
+        draw(rgb, masks, of, image.K, infos)[SCALE * top : SCALE * bottom, SCALE * left : SCALE * right] for of in poses
     ]
     gap = np.full((panels[0].shape[0], 8, 3), 255, dtype=np.uint8)
     return np.hstack([panels[0], gap, panels[1]])
@@ -81,9 +74,9 @@ def window(mask: NDArray[np.bool_], margin_px: int = 30) -> tuple[int, int, int,
 def draw(
     rgb: Picture,
     masks: list[NDArray[np.bool_]],
-    poses: list[tuple[int, list[float], list[float]]],
+    poses: list[tuple[int, NDArray[np.float64], NDArray[np.float64]]],
     K: NDArray[np.float64],
-    infos: dict[int, Entry],
+    infos: Mapping[int, ModelInfo],
 ) -> Picture:
     """The image, enlarged, with tinted masks, boxes in the classes' colours, and axes x red, y green, z blue."""
     drawn = rgb.astype(np.float64)
@@ -91,8 +84,7 @@ def draw(
         drawn[mask] = 0.8 * drawn[mask] + 0.2 * np.array(class_color(obj_id))
     size = (SCALE * rgb.shape[1], SCALE * rgb.shape[0])
     picture = cv2.resize(drawn.astype(np.uint8), size, interpolation=cv2.INTER_CUBIC).astype(np.uint8)
-    for obj_id, rotation, translation in poses:
-        R, t = np.array(rotation).reshape(3, 3), np.array(translation)
+    for obj_id, R, t in poses:
         lines(picture, box_lines(K, R, t, box_corners_mm(infos[obj_id])), repeat(class_color(obj_id)), 1)
         lines(picture, axis_lines(K, R, t, 0.45 * float(infos[obj_id]["diameter"])), AXES_COLORS, 3)
     return picture

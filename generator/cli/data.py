@@ -44,9 +44,12 @@ def coco_command(
 
     Canonical poses, and box corners as keypoints, are in it.
     """
+    from synthetless.dataset.labels import undisturbed
     from synthetless.exports.coco import export_coco
 
-    say(f"{export_coco(dataset, to, split, boxes)} images in {to}")
+    with undisturbed(dataset, may_grow=True):
+        count = export_coco(dataset, to, split, boxes)
+    say(f"{count} images in {to}")
 
 
 def webdataset_command(
@@ -61,11 +64,13 @@ def webdataset_command(
 
     The labels are in .gt_canonical.json.
     """
+    from synthetless.dataset.labels import undisturbed
     from synthetless.exports.webdataset import export_webdataset, relabel_webdataset
 
-    if relabel_only:
-        relabel_webdataset(dataset, to, split)
-        say(f"labels renewed in {to}")
-        return
-    shards = export_webdataset(dataset, to, split, images_per_shard, shuffle_seed)
+    with undisturbed(dataset, may_grow=True):
+        if relabel_only:
+            relabel_webdataset(dataset, to, split)
+            say(f"labels replaced in {to}")
+            return
+        shards = export_webdataset(dataset, to, split, images_per_shard, shuffle_seed)
     say(f"{len(shards)} images in {len(set(shards.values()))} shards in {to}")

@@ -1,4 +1,4 @@
-"""Commands that make images: generate, render, redo."""
+"""Commands that make images: generate, render, redo, redevelop."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer.core import TyperCommand
 
+from synthetless.cli.options import Workers
 from synthetless.cli.terminal import EXIT_FAILED, EXIT_INTERRUPTED, leave, say
+from synthetless.errors import UserError
 from synthetless.scenes.blender import Kind
 
 if TYPE_CHECKING:
@@ -179,10 +181,14 @@ def render_command(
     ] = None,
 ) -> None:
     """Render one recorded image again."""
+    from synthetless.dataset.layout import refuse_target
     from synthetless.generation.rerender import render_again
     from synthetless.io.files import atomic_write
     from synthetless.io.images import encode_png
 
+    refuse_target(dataset, to)
+    if to.exists():
+        raise UserError(f"{to}: exists already; give a new name")
     atomic_write(to, encode_png(render_again(dataset, scene, image, textures)))
     say(to)
 
@@ -206,3 +212,21 @@ def redo_command(
     except DropFailed as failure:
         leave(f"drop {drop}: {failure}", EXIT_FAILED)
     say(f"drop {drop}: {made} images in {dataset}")
+
+
+def redevelop_command(
+    dataset: Annotated[Path, typer.Argument(help="The dataset's folder; its outputs have exr.")],
+    to: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the new dataset.")],
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="sensor=NAME, or a setting of sensor; several times."),
+    ] = None,
+    workers: Workers = None,
+) -> None:
+    """Make other pictures of the same scenes, as another camera sees them.
+
+    Nothing is rendered, and no label changes. Example: synthetless redevelop out/a --to out/b --set sensor=primesense
+    """
+    from synthetless.generation.redevelop import redevelop
+
+    say(f"{redevelop(dataset, to, overrides or [], workers)} images in {to}")

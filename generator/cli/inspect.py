@@ -39,18 +39,24 @@ def preview_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print the statistics as JSON.")] = False,
 ) -> None:
     """Make a gallery and statistics for the browser."""
+    from synthetless.dataset.labels import undisturbed
     from synthetless.io.files import read_json
     from synthetless.preview import write_preview
     from synthetless.preview.pages import STATISTICS_FILE
 
-    page = write_preview(dataset, to, split, images, workers)
+    with undisturbed(dataset, may_grow=True):
+        page = write_preview(dataset, to, split, images, workers)
     statistics = read_json(page.parent / STATISTICS_FILE)
     say(json.dumps({"page": str(page), "statistics": statistics}) if as_json else f"preview: {page}")
 
 
 def validate_command(
     dataset: Annotated[Path, typer.Argument(help="The dataset's folder.")],
-    deep: Annotated[bool, typer.Option("--deep", help="Also measure masks and depth of some images again.")] = False,
+    deep: Annotated[bool, typer.Option("--deep", help="Recompute every image, however many there are.")] = False,
+    sample: Annotated[
+        int | None,
+        typer.Option(min=0, metavar="N", help="Recompute so many images at most, evenly spread; default: 30000."),
+    ] = None,
     exports: Annotated[
         list[Path] | None,
         typer.Option(
@@ -63,9 +69,10 @@ def validate_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Check every file, every label, and both against each other."""
-    from synthetless.validation import validate
+    from synthetless.validation import SAMPLE, validate
 
-    found = validate(dataset, deep, exports or (), limit)
+    most = SAMPLE if sample is None else sample
+    found = validate(dataset, None if deep else most, exports or (), limit)
     say(json.dumps(found.to_json()) if as_json else "\n".join(found.lines()))
     if not found.valid:
         raise typer.Exit(EXIT_FAILED)

@@ -65,6 +65,10 @@ def detect_command(
     tolerance_percent: Annotated[
         float, typer.Option(min=0, metavar="PERCENT", help="Largest residual, in % of the diameter.")
     ] = 1.0,
+    tolerance: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ID=VALUE|FILE", help="Of one object: 26=0.5mm or 26=2%; or a table of them. Repeatable."),
+    ] = None,
     scale: Annotated[
         float, typer.Option(min=0, metavar="FACTOR", help="Millimetres per unit of the files; 1000 for metres.")
     ] = 1.0,
@@ -76,9 +80,9 @@ def detect_command(
 
     The report also tells what every other group would leave as residual.
     """
-    from synthetless.symmetry.detection import detect_folder, report
+    from synthetless.symmetry.detection import detect_folder, parse_tolerances, report
 
-    detected = detect_folder(models, tolerance_percent, scale, workers)
+    detected = detect_folder(models, tolerance_percent, scale, workers, parse_tolerances(tolerance or ()))
     if out is not None:
         detected.table().write(out)
     if models_out is not None:

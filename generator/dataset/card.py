@@ -125,7 +125,7 @@ def _count_object(rows: NDArray[np.float64]) -> ObjectCounts:
 
 
 def _licence(recipe: Recipe) -> str:
-    """Licence and attribution of the models, "" if nobody has said."""
+    """Licence and attribution of the models, "" if the recipe does not say."""
     return recipe.source.licence or (_BUILTIN_LICENCE if recipe.source.models == BUILTIN else "")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetless.dataset.layout import PENDING_FILE, SYMMETRIES_FILE
+from synthetless.dataset.layout import DATASET_FILE, PENDING_FILE, SYMMETRIES_FILE
 from synthetless.dataset.reader import ScenePoses, as_floats
 from synthetless.dataset.records import CameraEntry, CanonicalEntry, GtEntry, ModelInfo
 from synthetless.errors import UserError
+from synthetless.io.files import is_locked
 from synthetless.symmetry import CanonicalMap, CanonicalPoses, SymmetryTable
 
 Floats = NDArray[np.float64]
@@ -107,6 +109,42 @@ def refuse_half_labelled(root: Path) -> None:
     """
     if is_half_labelled(root):
         raise UserError(f"{root}: is half relabelled; run relabel (or adopt) again, which completes it")
+
+
+@contextmanager
+def undisturbed(root: Path, may_grow: bool = False) -> Iterator[None]:
+    """For those who only read a dataset: what they conclude from files that change meanwhile would be false.
+
+    Nothing is written, so that a dataset on a read-only disk can be read.
+
+    Args:
+        root: the dataset's folder.
+        may_grow: whether new images may be added meanwhile; those who read assembled files do not notice.
+
+    Raises:
+        UserError: another process writes the dataset, or has written it before the block ended.
+    """
+    before = _stamps(root)
+
+    def refuse(strictly: bool) -> None:
+        now = _stamps(root)
+        if now[1:] != before[1:] or (strictly and (is_locked(root) or now != before)):
+            raise UserError(f"{root}: another synthetless is writing here, or was meanwhile; try again when it is done")
+
+    refuse(not may_grow)
+    try:
+        yield
+    except UserError:
+        refuse(strictly=True)
+        raise
+    refuse(not may_grow)
+
+
+def _stamps(root: Path) -> list[tuple[int, int] | None]:
+    """What becomes different when dataset.json is written anew; and, behind the first, when labels are."""
+    paths = [root / name for name in (DATASET_FILE, SYMMETRIES_FILE, PENDING_FILE)]
+    found = [path.stat() if path.exists() else None for path in paths]
+    return [None if status is None else (status.st_ino, status.st_mtime_ns) for status in found]
 
 
 def box_corners_mm(info: ModelInfo) -> Floats:

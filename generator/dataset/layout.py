@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
+from synthetless.config import SPLIT
 from synthetless.errors import UserError
 from synthetless.io.models import INFO_FILE
 
@@ -28,7 +29,6 @@ MODELS_FOLDER = "models"
 RECORDS_FOLDER = ".records"
 FAILURES_FOLDER = ".failures"
 LOGS_FOLDER = ".logs"
-SPLIT = "train_synthetless"
 PREVIEW_FOLDER = "preview"
 _MODELS_FOLDERS = (MODELS_FOLDER, "models_cad", "models_eval")
 _RESERVED = (
@@ -193,7 +193,7 @@ def scene_ids(dataset: Path, split: str = SPLIT) -> list[int]:
     folder = dataset / split
     if not folder.is_dir():
         known = ", ".join(sorted({paths.root.parent.name for paths in scene_folders(dataset, ["scene_camera.json"])}))
-        raise UserError(f"{folder}: no such split; {f'there are {known}' if known else 'this is no BOP dataset'}")
+        raise UserError(f"{folder}: no such split; {f'there are {known}' if known else 'this is not a BOP dataset'}")
     ids = sorted(int(entry.name) for entry in folder.iterdir() if entry.name.isdecimal() and entry.is_dir())
     if not ids:
         raise UserError(f"{folder}: holds no scene folders (000001, ...)")
@@ -204,6 +204,13 @@ def scene_folders(root: Path, having: Iterable[str]) -> list[ScenePaths]:
     """The scene folders SPLIT/%06d of all splits that have one of these files, in order."""
     folders = {path.parent for name in having for path in root.glob(f"*/*/{name}")}
     return [ScenePaths(folder) for folder in sorted(folders) if folder.name.isdecimal()]
+
+
+def other_sensors(folder: Path) -> list[str]:
+    """Ground truth of further sensors in a scene folder, such as scene_gt_cam1.json: BOP 2024 allows several."""
+    own = {"scene_gt_info.json", "scene_gt_coco.json", "scene_gt_canonical.json"}
+    names = sorted(path.name for path in folder.glob("scene_gt_*.json") if path.name not in own)
+    return [name for name in names if not name.startswith(("scene_gt_info_", "scene_gt_coco_"))]
 
 
 def refuse_target(root: Path, to: Path, own: str | None = None) -> None:

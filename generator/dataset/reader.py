@@ -14,13 +14,13 @@ import operator
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
-from typing import Any, SupportsIndex, TypeVar, overload
+from typing import Any, SupportsIndex, overload
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from synthetless.annotation.instances import Box
 from synthetless.config import Recipe
@@ -42,6 +42,7 @@ from synthetless.dataset.records import (
     GtInfoEntry,
     ImageSpec,
     read_scene_json,
+    validated,
 )
 from synthetless.errors import UserError
 from synthetless.io import images
@@ -51,7 +52,6 @@ from synthetless.symmetry import SymmetryTable
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-Kind = TypeVar("Kind")
 Where = Callable[[int], str]
 """Names a row's place for a message: file, image and instance."""
 
@@ -165,6 +165,10 @@ class Image:
         """(H, W, 3) sRGB."""
         path = self.paths.find_rgb(self.im_id) or self.paths.rgb(self.im_id)
         return images.decode_rgb(read_bytes(path), path)
+
+    def linear(self) -> NDArray[np.float32]:
+        """(H, W, 3) linear light before exposure, Rec. 709 primaries, if ``outputs`` has exr."""
+        return images.read_exr(self.paths.exr(self.im_id))
 
     def depth_mm(self) -> Floats:
         """(H, W) z in millimetres, 0 where there is no depth."""
@@ -442,7 +446,7 @@ class Dataset(Sequence[Image]):
             split: may be left out where there is only one.
 
         Raises:
-            UserError: this is no BOP dataset, the split is not in it, or there are several and none is named.
+            UserError: this is not a BOP dataset, the split is not in it, or there are several and none is named.
         """
         root = Path(root)
         split = split or find_split(root)
@@ -542,13 +546,13 @@ def read_entries(paths: ScenePaths) -> list[ImageEntries]:
         UserError: a file is missing or damaged, or the files disagree about the images or their instances.
     """
     entries = _read_entries(paths)
-    for path, schema, content in (
+    for path, form, content in (
         (paths.scene_camera, ForeignCameraEntry, {image.im_id: image.camera for image in entries}),
         (paths.scene_gt, list[ForeignGtEntry], {image.im_id: image.gt for image in entries}),
         (paths.scene_gt_info, list[ForeignGtInfoEntry], {image.im_id: image.gt_info for image in entries}),
         (paths.scene_gt_canonical, list[CanonicalEntry], {image.im_id: image.gt_canonical for image in entries}),
     ):
-        validated(schema_of(dict[int, schema]), content, path)  # type: ignore[valid-type]
+        validated(dict[int, form], content, path)  # type: ignore[valid-type]
     return entries
 
 
@@ -577,30 +581,9 @@ def read_specs(paths: ScenePaths) -> dict[int, ImageSpec]:
     """
     if not paths.scene_spec.exists():
         return {}
-    adapter = schema_of(ImageSpec)
-    specs = [validated(adapter, line, paths.scene_spec) for line in read_json_lines(paths.scene_spec)]
+    lines = read_json_lines(paths.scene_spec)
+    specs: list[ImageSpec] = [validated(ImageSpec, line, paths.scene_spec) for line in lines]
     return {spec.image_id: spec for spec in specs}
-
-
-@cache
-def schema_of(kind: type[Kind]) -> TypeAdapter[Kind]:
-    """The schema of a type of JSON data; made once, since that takes long."""
-    return TypeAdapter(kind)
-
-
-def validated(schema: TypeAdapter[Kind], content: Any, path: Path) -> Kind:
-    """The content of a file, held against its schema.
-
-    Raises:
-        UserError: it is otherwise; with the file, the place in it, and what was expected.
-    """
-    try:
-        return schema.validate_python(content)
-    except ValidationError as error:
-        fault = error.errors()[0]
-        place = ".".join(str(part) for part in fault["loc"])
-        found = reprlib.repr(fault["input"])
-        raise UserError(f"{path}: {place}: {fault['msg']}, but it is {found}") from None
 
 
 def read_recipe(root: Path) -> Recipe:

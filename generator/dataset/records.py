@@ -8,19 +8,22 @@ https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, NotRequired
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, with_config
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, with_config
+from pydantic_core import ErrorDetails
 from typing_extensions import TypedDict
 
 from synthetless.annotation.instances import InstanceAnnotation
 from synthetless.errors import UserError
+from synthetless.io.documents import shown
 from synthetless.io.files import read_json, write_json
-from synthetless.scenes.spec import Intrinsics, Pose, SceneSpec
+from synthetless.scenes.spec import Intrinsics, Pose, SceneSpec, SensorSpec
 
 MIN_VISIB_FRACT = 0.1
 """Instances with a smaller visible fraction are marked ``ignore`` in scene_gt_coco.json, as bop_toolkit does."""
@@ -94,24 +97,26 @@ class ForeignCameraEntry(TypedDict):
 
 
 @with_config(_OPEN)
-class ForeignGtEntry(TypedDict):
+class ForeignGtEntry(GtEntry):
     """An instance in somebody else's scene_gt.json, which may say more."""
-
-    cam_R_m2c: Matrix
-    cam_t_m2c: Vector
-    obj_id: Count
 
 
 @with_config(_OPEN)
-class ForeignGtInfoEntry(TypedDict):
+class ForeignGtInfoEntry(GtInfoEntry):
     """An instance in somebody else's scene_gt_info.json, which may say more."""
 
-    bbox_obj: BoxList
-    bbox_visib: BoxList
-    px_count_all: Count
-    px_count_valid: Count
-    px_count_visib: Count
-    visib_fract: NotNegative
+
+@with_config(_OPEN)
+class ModelEntry(TypedDict):
+    """An object in models_info.json, millimetres; ``SymmetryGroup.from_bop`` reads its symmetries."""
+
+    diameter: Positive
+    min_x: Number
+    min_y: Number
+    min_z: Number
+    size_x: NotNegative
+    size_y: NotNegative
+    size_z: NotNegative
 
 
 @with_config(_EXACT)
@@ -124,9 +129,8 @@ class RunLengths(TypedDict):
 
 @with_config(_EXACT)
 class CocoAnnotation(TypedDict):
-    """An instance in scene_gt_coco.json; ``id`` is counted when a scene folder's images are put together."""
+    """An instance in scene_gt_coco.json, without its id."""
 
-    id: NotRequired[Count]
     image_id: Count
     category_id: Count
     iscrowd: int
@@ -136,6 +140,13 @@ class CocoAnnotation(TypedDict):
     ignore: bool
     width: Count
     height: Count
+
+
+@with_config(_EXACT)
+class NumberedAnnotation(CocoAnnotation):
+    """An instance in scene_gt_coco.json; ``id`` is counted when a scene folder's images are put together."""
+
+    id: Count
 
 
 @with_config(_EXACT)
@@ -165,7 +176,7 @@ class CocoCategory(TypedDict):
 class CocoFile(TypedDict):
     """scene_gt_coco.json."""
 
-    annotations: list[CocoAnnotation]
+    annotations: list[NumberedAnnotation]
     categories: list[CocoCategory]
     images: list[CocoImage]
     info: dict[str, str]
@@ -196,6 +207,7 @@ class ImageSpec:
         instances: number in ``scene.objects`` of each labelled instance, in scene_gt's order.
         scene: what was built.
         settled: pose of each object at rest.
+        sensor: the camera that took the picture; without one, the record leaves it out.
     """
 
     image_id: int
@@ -204,6 +216,7 @@ class ImageSpec:
     instances: tuple[int, ...]
     scene: SceneSpec
     settled: tuple[Pose, ...]
+    sensor: SensorSpec | None = None
 
 
 class ImageRecord(TypedDict):
@@ -217,6 +230,61 @@ class ImageRecord(TypedDict):
     gt_info: list[GtInfoEntry]
     coco: list[CocoAnnotation]
     spec: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class SchemaFault:
+    """Where in a JSON value it departs from its schema, and how."""
+
+    place: tuple[int | str, ...]
+    message: str
+
+    @property
+    def instance(self) -> int | None:
+        """The list index that the place begins with, if it does."""
+        return self.place[0] if self.place and isinstance(self.place[0], int) else None
+
+
+@cache
+def schema(form: Any) -> TypeAdapter[Any]:
+    """The schema of a type of this module; made once, since that takes long."""
+    return TypeAdapter(form)
+
+
+def schema_faults(form: Any, value: Any) -> list[SchemaFault]:
+    """Every departure of a parsed JSON value from the schema of a type of this module, ``list[GtEntry]`` say."""
+    try:
+        schema(form).validate_python(value)
+    except ValidationError as error:
+        return [_schema_fault(fault) for fault in error.errors(include_url=False)]
+    return []
+
+
+def validated(form: Any, value: Any, path: Path) -> Any:
+    """A parsed JSON value as a type of this module.
+
+    Raises:
+        UserError: it departs from the schema; with the file, the first place in it, and what was expected.
+    """
+    try:
+        return schema(form).validate_python(value)
+    except ValidationError as error:
+        raise UserError(f"{path}: {_schema_fault(error.errors(include_url=False)[0]).message}") from None
+
+
+def _schema_fault(fault: ErrorDetails) -> SchemaFault:
+    name = ".".join(str(part) for part in fault["loc"]) or "it"
+    if fault["type"] == "missing":
+        return SchemaFault(fault["loc"], f"{name} is missing")
+    return SchemaFault(fault["loc"], f"{name} is {shown(fault['input'])}: {fault['msg'][0].lower()}{fault['msg'][1:]}")
+
+
+def spec_entry(spec: ImageSpec) -> dict[str, Any]:
+    """An image's line in scene_spec.jsonl."""
+    entry = asdict(spec)
+    if spec.sensor is None:
+        del entry["sensor"]
+    return entry
 
 
 def write_scene_json(path: Path, entries: Mapping[int, Any]) -> None:

@@ -37,10 +37,20 @@ from synthetless.dataset.layout import (
     SYMMETRIES_FILE,
     ScenePaths,
     find_models_folder,
+    other_sensors,
     scene_folders,
 )
 from synthetless.dataset.reader import as_floats, read_recipe
-from synthetless.dataset.records import CanonicalEntry, GtEntry, ModelInfo, read_scene_json
+from synthetless.dataset.records import (
+    CanonicalEntry,
+    ForeignCameraEntry,
+    ForeignGtEntry,
+    GtEntry,
+    ModelEntry,
+    ModelInfo,
+    read_scene_json,
+    schema_faults,
+)
 from synthetless.errors import UserError
 from synthetless.io.documents import read_document
 from synthetless.io.files import atomic_write, json_bytes, locked, read_bytes, read_json, replace_file, write_json
@@ -229,11 +239,14 @@ def adopt(
     scenes = _adoptable_scenes(root)
     models = models or find_models_folder(root)
     models_info = read_models_info(models)
+    for obj_id, info in models_info.items():
+        for fault in schema_faults(ModelEntry, info):
+            raise UserError(f"{models / INFO_FILE}: object {obj_id}: {fault.message}")
     table = revised(_declared(scenes, models, models_info, symmetries, workers), symmetries, scheme, models_info)
     with locked(root):
         _refuse_foreign(root, scenes)
         with _draft(root) as draft:
-            labelled = _label_folders(scenes, table, models_info, None, workers)
+            labelled = _label_folders(scenes, table, models_info, None, workers, foreign=True)
             counts = [_counted(scene) for scene in _laid_out(labelled, root, draft)]
             _replace_labels(root, draft, table)
     splits = tuple(sorted({scene.root.parent.name for scene in scenes}))
@@ -381,6 +394,7 @@ class _Task:
     table: str
     models_info: Mapping[int, ModelInfo]
     only: frozenset[int] | None
+    foreign: bool
 
 
 def _label_folders(
@@ -389,12 +403,14 @@ def _label_folders(
     models_info: Mapping[int, ModelInfo],
     only: frozenset[int] | None,
     workers: int | None,
+    foreign: bool = False,
 ) -> Iterator[_LabelledScene]:
     """Label scene folders side by side, and tell of each in turn; nothing is written.
 
-    ``only`` names the objects to label, where the labels of the others can be read; None for all.
+    ``only`` names the objects to label, where the labels of the others can be read; None for all. The entries of
+    ``foreign`` datasets are held against their schemas.
     """
-    tasks = [_Task(scene, json.dumps(table.to_dict()), models_info, only) for scene in scenes]
+    tasks = [_Task(scene, json.dumps(table.to_dict()), models_info, only, foreign) for scene in scenes]
     return each(_label_folder, tasks, workers, "labels", "scene")
 
 
@@ -417,13 +433,37 @@ def _label_folder(task: _Task) -> _LabelledScene:
     stored = _stored_labels(paths, gt)
     only = None if stored is None else task.only
     try:
+        if task.foreign:
+            _refuse_camera_models(camera)
         labels = label_scene(gt, camera, _table(task.table), task.models_info, only, stored)
+        if task.foreign:
+            _refuse_invalid(gt, camera)
     except UserError as error:
         raise UserError(f"{paths.root}: {error}") from None
     path = paths.scene_gt_canonical
     content = json_bytes(path, {str(im_id): entries for im_id, entries in labels.items()})
     unchanged = path.exists() and content == read_bytes(path)
     return _LabelledScene(paths, None if unchanged else content, len(gt), _diffs(labels, stored, only))
+
+
+def _refuse_camera_models(scene_camera: Mapping[int, object]) -> None:
+    for im_id, entry in scene_camera.items():
+        if isinstance(entry, dict) and "cam_model" in entry and "cam_K" not in entry:
+            raise UserError(
+                f"scene_camera.json: image {im_id} has cam_model instead of cam_K, as BOP has it since 2024; only "
+                "pinhole cameras are supported"
+            )
+
+
+def _refuse_invalid(scene_gt: Mapping[int, object], scene_camera: Mapping[int, object]) -> None:
+    """What can be labelled, but is not what the reader and ``validate`` take: numbers as text, say."""
+    for name, form, content in (
+        ("scene_gt.json", list[ForeignGtEntry], scene_gt),
+        ("scene_camera.json", ForeignCameraEntry, scene_camera),
+    ):
+        for im_id, entry in content.items():
+            for fault in schema_faults(form, entry):
+                raise UserError(f"{name}: image {im_id}: {fault.message}")
 
 
 @lru_cache(maxsize=1)
@@ -520,6 +560,12 @@ def _adoptable_scenes(root: Path) -> list[ScenePaths]:
         raise UserError(f"{root}: no such folder; give that of a BOP dataset")
     if (root / DATASET_FILE).exists():
         raise UserError(f"{root}: holds a {DATASET_FILE}: synthetless made it, so use relabel")
+    for folder in sorted({path.parent for path in root.glob("*/*/scene_gt_*.json")}):
+        if sensors := other_sensors(folder):
+            raise UserError(
+                f"{folder}: has {sensors[0]}, several sensors in one scene folder, as BOP allows since 2024; this is "
+                "not supported: give the images of each sensor a scene folder with a scene_gt.json of its own"
+            )
     scenes = scene_folders(root, ("scene_gt.json",))
     if not scenes:
         raise UserError(f"{root}: holds no ground truth of a BOP dataset, such as test_primesense/000001/scene_gt.json")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
@@ -40,10 +40,11 @@ from synthetless.dataset.reader import read_recipe
 from synthetless.dataset.records import CocoFile, GtEntry, ImageRecord, ImageSpec, ModelInfo
 from synthetless.errors import UserError
 from synthetless.io import images
-from synthetless.io.color import exposure_gain, tonemap
+from synthetless.io.color import exposure_gain, picture
 from synthetless.io.files import atomic_write, in_turn, read_json, replace_file, write_json, write_json_lines
 from synthetless.io.models import INFO_FILE, ObjectModel
-from synthetless.scenes.spec import Pose, SceneSpec
+from synthetless.scenes.sampling import sample_sensor
+from synthetless.scenes.spec import Pose, SceneSpec, SensorSpec
 from synthetless.symmetry import SymmetryTable
 
 _SIX_DIGITS = re.compile(r"\d{6}")
@@ -89,9 +90,14 @@ class FinishedImage:
             linear: (H, W, 3) rendered light, Rec. 709 primaries; None if nothing was rendered.
         """
         gain = 1.0 if linear is None else exposure_gain(linear, recipe.render.exposure)
-        rgb = None if linear is None else tonemap(linear, gain)
+        rgb = None if linear is None else picture(linear, gain, planned_sensor(recipe, plan))
         files = _encode(recipe, plan.im_id, annotated.image, rgb, linear)
         return cls(plan, files, image_record(recipe, plan, scene, settled, annotated, gain))
+
+
+def planned_sensor(recipe: Recipe, plan: ImagePlan) -> SensorSpec | None:
+    """The camera of an image; None if the recipe has none."""
+    return None if recipe.sensor is None else sample_sensor(recipe.sensor, recipe.seed, plan.drop, plan.view)
 
 
 def image_record(
@@ -105,13 +111,14 @@ def image_record(
     """The record of an image; arguments as for ``FinishedImage.of``."""
     K, scale = records.camera_matrix(recipe.intrinsics), recipe.encoding.depth_scale
     instances = annotated.image.instances
-    spec = ImageSpec(plan.im_id, plan.view, exposure_gain, annotated.numbers, scene, tuple(settled))
+    sensor = planned_sensor(recipe, plan)
+    spec = ImageSpec(plan.im_id, plan.view, exposure_gain, annotated.numbers, scene, tuple(settled), sensor)
     return {
         "camera": records.camera_entry(K, annotated.R_w2c, annotated.t_w2c, scale),
         "gt": [records.gt_entry(model.obj_id, model.R_m2c, model.t_m2c) for model in annotated.models],
         "gt_info": [records.gt_info_entry(instance) for instance in instances],
         "coco": records.coco_annotations(plan.im_id, [model.obj_id for model in annotated.models], instances),
-        "spec": asdict(spec),
+        "spec": records.spec_entry(spec),
     }
 
 
@@ -295,6 +302,12 @@ class DatasetStore:
             SymmetryTable.from_models_info(infos, self.recipe.labels.scheme).write(self.root / SYMMETRIES_FILE)
 
 
+def encode_rgb(recipe: Recipe, rgb: NDArray[np.uint8]) -> bytes:
+    """The file of an (H, W, 3) sRGB image."""
+    encoding = recipe.encoding
+    return images.encode_png(rgb) if encoding.rgb_format == "png" else images.encode_jpeg(rgb, encoding.jpeg_quality)
+
+
 def _encode(
     recipe: Recipe,
     im_id: int,
@@ -307,9 +320,7 @@ def _encode(
     files: dict[Path, bytes] = {}
     wanted = set(recipe.outputs)
     if "rgb" in wanted and rgb is not None:
-        png = encoding.rgb_format == "png"
-        content = images.encode_png(rgb) if png else images.encode_jpeg(rgb, encoding.jpeg_quality)
-        files[paths.rgb(im_id, encoding.rgb_format)] = content
+        files[paths.rgb(im_id, encoding.rgb_format)] = encode_rgb(recipe, rgb)
     if "exr" in wanted and linear is not None:
         files[paths.exr(im_id)] = images.encode_exr(linear)
     if "depth" in wanted:

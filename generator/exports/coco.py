@@ -20,8 +20,8 @@ from typing_extensions import TypedDict
 
 from synthetless.dataset.labels import BOX_EDGES, refuse_half_labelled
 from synthetless.dataset.layout import DATASET_FILE, ScenePaths, find_split, refuse_target, scene_ids
-from synthetless.dataset.reader import ImageEntries, read_entries, schema_of, validated
-from synthetless.dataset.records import Count
+from synthetless.dataset.reader import ImageEntries, read_entries
+from synthetless.dataset.records import Count, validated
 from synthetless.errors import UserError
 from synthetless.io.files import atomic_file, read_json, remove_drafts
 
@@ -156,7 +156,7 @@ def export_coco(dataset: Path, to: Path, split: str | None = None, boxes: BoxKin
     for scene_id in tqdm(scene_ids(dataset, split), desc="COCO", unit="scene", disable=None):
         scene = ScenePaths.of(dataset, scene_id, split)
         coco: Any = read_json(scene.scene_gt_coco)  # as it stands there: categories may say more than is asked for
-        validated(schema_of(_SceneFile), coco, scene.scene_gt_coco)
+        validated(_SceneFile, coco, scene.scene_gt_coco)
         categories |= {category["id"]: _with_corners(category) for category in coco["categories"]}
         for labels, image, visible in _by_image(scene, coco):
             image_id = len(images) + 1
@@ -184,7 +184,7 @@ def _refuse_others(to: Path) -> None:
         with to.open("rb") as file:
             if _BEGINNING.match(file.read(4096)):
                 return
-    raise UserError(f"{to}: exists already and is no COCO export; give a new name")
+    raise UserError(f"{to}: exists already and is not a COCO export; give a new name")
 
 
 def _by_image(

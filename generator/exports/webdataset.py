@@ -133,7 +133,7 @@ def relabel_webdataset(
     if key_to_shard.keys() != images.keys():
         odd = min(key_to_shard.keys() ^ images.keys())
         place = "shards" if odd in key_to_shard else "dataset"
-        raise UserError(f"{shards}: image {odd} is only in the {place}; export the dataset anew")
+        raise UserError(f"{shards}: image {odd} is only in the {place}; export the dataset again")
     remove_drafts(shards)  # of a run that was killed
     _withdraw(shards / KEYS_FILE)
     tasks = [(path, [images[key] for key in shard]) for path, shard in zip(paths, keys, strict=True)]
@@ -152,7 +152,7 @@ def _images(dataset: Path, split: str) -> Iterator[ShardImage]:
 def _richest_first(images: list[ShardImage]) -> list[ShardImage]:
     """Move the image with the most instances to the front.
 
-    Hugging Face's loader infers the columns from the first five images and drops, without a word, the masks of
+    Hugging Face's loader infers the columns from the first five images and silently drops the masks of
     every later image that has more instances than those.
     """
     richest = max(range(len(images)), key=lambda i: images[i].instances)
@@ -256,7 +256,7 @@ def _names(path: Path) -> list[str]:
         with tarfile.open(path, "r:") as tar:
             return tar.getnames()
     except (tarfile.TarError, OSError) as error:
-        raise UserError(f"{path}: not a readable shard ({error}); export the dataset anew") from None
+        raise UserError(f"{path}: not a readable shard ({error}); export the dataset again") from None
 
 
 def _key(member_name: str) -> str:

@@ -34,7 +34,7 @@ CPU = Devices()
 
 
 def choose(wanted: str) -> Devices:
-    """Find the devices of a kind; "auto" takes the best that there is.
+    """Find the devices of a kind; "auto" takes the fastest kind.
 
     Raises:
         UserError: this machine has none of them; the message says what it has.
@@ -83,14 +83,14 @@ def best(seen: list[str], wanted: str) -> Devices:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a process of its own found out: ``found``, or the ``problem`` it had instead, one line."""
+    """Result of a command in a process of its own: the object it ``found``, or else its ``problem``, one line."""
 
     found: dict[str, Any] | None
     problem: str = ""
 
 
 def ask(command: Sequence[str], timeout_s: float = 300.0) -> Answer:
-    """Run a command that prints a JSON object as its last line; whatever happens to it, this process lives on."""
+    """Run a command that prints a JSON object as its last line; its crash does not affect this process."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=timeout_s, check=False)
     except subprocess.TimeoutExpired:

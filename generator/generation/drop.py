@@ -68,7 +68,7 @@ class DropRenderer:
             self._meshes,
             recipe.intrinsics,
             recipe.render,
-            recipe.table.size_m,
+            recipe.table,
             sources.photos_folder,
             threads,
             device,
@@ -92,7 +92,7 @@ class DropRenderer:
                 yield self._image(plan, scene, settled)
 
     def drop(self, drop: int) -> tuple[SceneSpec, tuple[Pose, ...]]:
-        """Throw until the objects come to rest.
+        """Throw the objects until they come to rest.
 
         Returns:
             The scene and each object's pose at rest.

@@ -1,4 +1,4 @@
-"""What a dataset would take: images, drops, time and disk, before the night is spent."""
+"""What a dataset would take, before it is made: images, drops, time and disk."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PROBES = 2
 
 @dataclass(frozen=True)
 class Estimate:
-    """What is to be made, and what that takes.
+    """The images that are missing, and what it takes to make them.
 
     Attributes:
         images, drops: still to be made.
@@ -68,7 +68,7 @@ class Estimate:
 
 
 def estimate(recipe: Recipe, out: Path, execution: Execution) -> Estimate:
-    """Make a few images, keep none, and say what all of them would take.
+    """Make a few images, keep none, and estimate what all of them would take.
 
     Raises:
         UserError: the work is for a cluster, or the recipe's sources or the folder cannot be used.
@@ -105,7 +105,7 @@ def estimate(recipe: Recipe, out: Path, execution: Execution) -> Estimate:
 
 
 def _measure(recipe: Recipe, sources: Sources, execution: Execution, drops: list[int]) -> tuple[float, float, int]:
-    """Seconds of a drop, seconds and bytes of an image of it; what is done once only is not counted."""
+    """Seconds of a drop, seconds and bytes of an image of it; what is done only once is not counted."""
     if not drops:
         return 0.0, 0.0, 0
     renderer = DropRenderer(recipe, sources, execution.threads, devices.take(execution.devices))

@@ -1,4 +1,4 @@
-"""Makes a dataset: what is missing of it, drop by drop, until it is complete."""
+"""Makes a dataset: its missing images, drop by drop, until it is complete."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _BETWEEN_ASSEMBLIES_S = 60.0
 
 @dataclass(frozen=True)
 class Summary:
-    """What there is after a run.
+    """The dataset after a run.
 
     Attributes:
         images, instances: in the whole dataset.
@@ -51,7 +51,7 @@ class Summary:
 
 @dataclass(frozen=True)
 class Execution:
-    """How the work is done; nothing of it changes what is made.
+    """How the work is done; the files do not depend on it.
 
     Attributes:
         workers: processes that make drops side by side; None for as many as there are cores, or GPUs.
@@ -75,7 +75,7 @@ class Execution:
 
     @property
     def processes(self) -> int:
-        """How many workers this machine gets: one per core, or per GPU, if not said."""
+        """Number of workers on this machine: one per core, or per GPU, unless given."""
         of_machine = usable_cores() if self.devices.kind == "cpu" else self.devices.count
         return self.workers or of_machine
 
@@ -116,7 +116,7 @@ def generate(recipe: Recipe, out: Path, execution: Execution) -> Summary:
 
 
 def wanted(dataset: DatasetStore, part: Part | None) -> list[int]:
-    """Numbers of the images that do not exist yet and are this run's to make."""
+    """Numbers of the images that do not exist yet and belong to this run, ascending."""
     views = dataset.recipe.camera.views_per_drop
     return [number for number in dataset.missing() if part is None or part.takes(plan_image(number, views).drop)]
 
@@ -194,7 +194,7 @@ def _draw_sheet(dataset: DatasetStore) -> None:
 
 
 def _note_failure(dataset: DatasetStore, sources: Sources, result: DropResult) -> None:
-    """Leave a note of a failed drop with the scene that it began with; take away that of one that went well."""
+    """Write a note of a failed drop, with the scene that it began with; remove that of one that has been made."""
     drop, recipe = result.task.drop, dataset.recipe
     path = _failure_note(dataset.root, drop)
     if result.failure:

@@ -1,4 +1,4 @@
-"""Renders a recorded image again, from nothing but what the dataset says of it."""
+"""Renders a recorded image again, from its record alone."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from synthetless.dataset.layout import MODELS_FOLDER, ScenePaths
 from synthetless.dataset.reader import read_recipe, read_specs
 from synthetless.errors import UserError
 from synthetless.generation.sources import models_folder
-from synthetless.io.color import tonemap
+from synthetless.io.color import picture
 from synthetless.io.models import ObjectModel, load_models
 from synthetless.scenes.render import BlenderSession
 from synthetless.scenes.spec import Mesh, Role, SceneSpec
@@ -44,10 +44,10 @@ def render_again(dataset: Path, scene_id: int, im_id: int, textures: Path | None
     if textures is None and recipe.source.textures != BUILTIN:
         textures = Path(recipe.source.textures)
     session = BlenderSession(
-        _meshes(dataset, recipe, image.scene), recipe.intrinsics, recipe.render, recipe.table.size_m, textures
+        _meshes(dataset, recipe, image.scene), recipe.intrinsics, recipe.render, recipe.table, textures
     )
     with session.scene(image.scene, image.settled) as scene:
-        return tonemap(scene.render(image.view), image.exposure_gain)
+        return picture(scene.render(image.view), image.exposure_gain, image.sensor)
 
 
 def _meshes(dataset: Path, recipe: Recipe, scene: SceneSpec) -> Mapping[tuple[Role, int], Mesh]:

@@ -77,7 +77,7 @@ def load_sources(recipe: Recipe) -> Sources:
 
 
 def check_photos(sources: Sources) -> None:
-    """Decode every photograph once, so that a damaged one is known before the night and not in the middle of it.
+    """Decode every photograph once, so that a damaged one is found before the run and not in the middle of it.
 
     Raises:
         UserError: one cannot be decoded.

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from synthetless.scenes.sensor import expose
+from synthetless.scenes.spec import SensorSpec
 from synthetless.scenes.srgb import LUMINANCE_WEIGHTS, linear_from_srgb, srgb_from_linear
 
 _GAIN_STEPS = 24
@@ -39,6 +41,11 @@ def tonemap(linear: NDArray[np.float32], gain: float) -> NDArray[np.uint8]:
     """(H, W, 3) linear light, times a gain, as 8-bit sRGB."""
     displayed: NDArray[np.uint8] = np.rint(srgb_from_linear(linear * np.float32(gain)) * 255).astype(np.uint8)
     return displayed
+
+
+def picture(linear: NDArray[np.float32], gain: float, sensor: SensorSpec | None) -> NDArray[np.uint8]:
+    """The image that is stored: as a camera takes it, or, without one, the plain tone mapping."""
+    return tonemap(linear, gain) if sensor is None else expose(linear, sensor, gain)
 
 
 def mean_luminance(rgb: NDArray[np.uint8]) -> float:

@@ -272,6 +272,17 @@ def locked(root: Path, part: str | None = None) -> Iterator[None]:
             yield
 
 
+def is_locked(root: Path) -> bool:
+    """Whether another process holds a lock on a dataset's folder. Nothing is written."""
+    for path in root.glob(".synthetless*.lock"):
+        with suppress(FileNotFoundError, PermissionError), path.open("rb") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return True
+    return False
+
+
 @contextmanager
 def in_turn(root: Path) -> Iterator[None]:
     """Wait until no other process assembles the folder, and keep them waiting for the duration."""

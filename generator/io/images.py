@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synthetless.errors import UserError
+from synthetless.scenes import render
 
 COORDINATE_SCALE_MM = 0.02
 """Object coordinates are stored in steps of this size, so the rounding error is at most 0.01 mm."""
@@ -39,6 +40,10 @@ _COORDINATE_LIMIT_MM = COORDINATE_SCALE_MM * _NORMAL_SCALE
 _RUNS = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
 _QUICK_TO_READ = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT)
 _DEFLATE = (cv2.IMWRITE_PNG_COMPRESSION, 3)
+
+
+class DamagedImageError(UserError):
+    """A file that cannot be decoded: cut off, damaged, or no image at all."""
 
 
 def max_depth_mm(depth_scale: float) -> float:
@@ -190,7 +195,7 @@ def _encode(extension: str, image: NDArray[Any], parameters: Sequence[int]) -> b
 def _decode(data: bytes, name: str | Path, dtype: type[np.generic], channels: int) -> NDArray[Any]:
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if image is None:
-        raise UserError(f"{name}: not a readable image of {len(data)} bytes, cut off or damaged")
+        raise DamagedImageError(f"{name}: not a readable image of {len(data)} bytes, cut off or damaged")
     found = 1 if image.ndim == 2 else image.shape[2]
     if image.dtype != dtype or found != channels:
         bits, expected = 8 * image.dtype.itemsize, 8 * np.dtype(dtype).itemsize
@@ -213,3 +218,22 @@ def encode_exr(linear: NDArray[np.float32]) -> bytes:
         path = Path(folder) / "image.exr"
         OpenEXR.File(header, {"RGB": pixels}).write(str(path))
         return path.read_bytes()
+
+
+def read_exr(path: Path) -> NDArray[np.float32]:
+    """(H, W, 3) float32 of an OpenEXR file of linear light.
+
+    Raises:
+        UserError: it is missing or damaged, holds something else, or the OpenEXR package is not installed.
+    """
+    if not path.is_file():
+        raise UserError(f"{path}: not found")
+    try:
+        linear = render.read_exr(path)
+    except ModuleNotFoundError:
+        raise UserError(f"{path}: to read it, the OpenEXR package is needed; install synthetless[blender]") from None
+    except (RuntimeError, KeyError, ValueError) as error:
+        raise UserError(f"{path}: cannot be decoded ({' '.join(str(error).split())})") from None
+    if linear.ndim != 3 or linear.shape[2] != 3 or not np.isfinite(linear).all():
+        raise UserError(f"{path}: holds an image of shape {linear.shape}; three channels of finite light are needed")
+    return linear

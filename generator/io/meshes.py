@@ -1,9 +1,9 @@
 """Mesh files: PLY, STL, OBJ and OFF, read as triangles; the only mesh reader of the project.
 
-Libraries were tried first. trimesh cuts concave polygons into overlapping triangles, refuses polygons of several sizes
-in one PLY file and drops what it does not understand without a word; meshio sorts the faces by their number of
-corners; both import slowly and parse the text of the T-LESS models three times slower than this. Polygons are cut by
-Manifold's triangulator, which keeps every corner, also those on a straight edge.
+Libraries were tried first. trimesh (5.2) cuts concave polygons into overlapping triangles and refuses polygons of
+several sizes in one PLY file, spare bytes and Latin-1 comments; meshio (5.3) fails on these, too, and on a list called
+vertex_index. They take three and six times as long for the text of the T-LESS models. Polygons are cut by Manifold's
+triangulator, which keeps every corner, also those on a straight edge.
 """
 
 from __future__ import annotations
@@ -30,6 +30,10 @@ _FLAT = 1e-6
 """A mesh is flat if it is thinner than this share of its extent."""
 _SLIVER = 1e-6
 """A polygon is cut another way rather than into a triangle of less than this share of its area."""
+_LARGEST = 1e30
+"""A coordinate beyond it is none of a part, and its square would leave the range of numbers."""
+_MOST_CORNERS = 10_000
+"""Of a concave polygon; checking it takes the square of its corners."""
 _BLOCK = 1024
 
 
@@ -163,7 +167,7 @@ def _mesh_of(polygons: _Polygons, scale: float) -> TriangleMesh:
         raise _Fault(f"face {face} names vertex {corners[wrong]}, but there are only {len(vertices)}, counted from 0")
     used = np.zeros(len(vertices), dtype=bool)
     used[corners] = True
-    bad = np.flatnonzero(used & ~np.isfinite(vertices).all(axis=1))
+    bad = np.flatnonzero(used & ~(np.abs(vertices) < _LARGEST).all(axis=1))
     if len(bad):
         raise _Fault(f"vertex {bad[0]} is {vertices[bad[0]].tolist()}; every coordinate must be finite")
     faces = _triangulate(vertices, corners, polygons.sizes)
@@ -222,6 +226,8 @@ def _cut(points: Floats, polygon: int) -> Ints:
     """(T, 3) triangles, as numbers of corners, that cover a polygon (N, 3) of any form."""
     from manifold3d import triangulate
 
+    if len(points) > _MOST_CORNERS:
+        raise _Fault(f"face {polygon} has {len(points)} corners; triangulate the mesh in the program that it is from")
     distinct = np.flatnonzero((points != np.roll(points, 1, axis=0)).any(axis=1))
     ring = points[distinct]
     if len(ring) < 3:
@@ -247,7 +253,11 @@ def _covers_once(ring: Floats, triangles: Ints) -> bool:
     if not (whole > 0 and (areas > -_SLIVER * whole).all()):
         return False
     centres = ((a + b + c) / 3)[areas > _SLIVER * whole]
-    before, after = ring[None] - centres[:, None], np.roll(ring, -1, axis=0)[None] - centres[:, None]
+    return all(_winds_once(ring, centres[i : i + _BLOCK]) for i in range(0, len(centres), _BLOCK))
+
+
+def _winds_once(ring: Floats, points: Floats) -> bool:
+    before, after = ring[None] - points[:, None], np.roll(ring, -1, axis=0)[None] - points[:, None]
     turns = np.arctan2(_cross2(before, after), (before * after).sum(axis=2)).sum(axis=1)
     return bool((np.abs(turns / (2 * np.pi) - 1) < 0.5).all())
 
@@ -315,7 +325,7 @@ def _read_ply(data: bytes) -> _Polygons:
     numbers = corners.astype(np.int64)
     if (numbers != corners).any():
         raise _Fault(f"a face names vertex {corners[numbers != corners][0]:g}; whole numbers are needed")
-    return _Polygons(vertices, numbers, sizes, header.isascii() and b"\r" not in header and body.is_at_end())
+    return _Polygons(vertices, numbers, sizes, header.isascii() and b"\n" in header and body.is_at_end())
 
 
 def _ply_header(data: bytes) -> tuple[bytes, str, list[_Element]]:

@@ -33,7 +33,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """What a dataset says of itself: N labelled instances in M images.
+    """What is observed in a dataset: N labelled instances in M images.
 
     Attributes:
         obj_id: (N,) object ids.

@@ -1,4 +1,4 @@
-"""One image for the pages: its small pictures, and everything that can be drawn into them or told beside them.
+"""One image for the pages: its small pictures, and everything that is drawn into them or listed beside them.
 
 What is drawn is data, as outlines and lines in pixels of the image; pixel (i, j) has its centre at (u, v) = (i, j).
 """
@@ -22,7 +22,7 @@ from synthetless.dataset.records import ImageSpec, ModelInfo
 from synthetless.errors import UserError
 from synthetless.io import images
 from synthetless.io.files import atomic_write, read_bytes
-from synthetless.scenes.spec import Material, PlaneSpec, Vector, View
+from synthetless.scenes.spec import Material, PlaneSpec, SensorSpec, Vector, View
 from synthetless.scenes.srgb import srgb_from_linear
 from synthetless.scenes.textures import PhotoTexture
 
@@ -274,6 +274,7 @@ def _sections(K: Floats, recorded: ImageSpec | None) -> list[Section]:
                 ["objects dropped", str(len(spec.objects))],
             ],
         },
+        *([] if recorded.sensor is None else [{"title": "Sensor", "rows": _sensor_rows(recorded.sensor)}]),
     ]
 
 
@@ -294,6 +295,21 @@ def _plane_rows(plane: PlaneSpec) -> list[list[str]]:
         ["tile", f"{plane.tile_m:.2f} m, turned {plane.rotation_deg:.0f}°"],
         ["roughness", f"{plane.roughness:.2f}"],
         ["specular", f"{plane.specular:.2f}"],
+    ]
+
+
+def _sensor_rows(sensor: SensorSpec) -> list[list[str]]:
+    return [
+        ["point spread", f"{sensor.blur_px:.2f} px"],
+        ["vignetting", f"{sensor.vignetting:.2f}"],
+        ["over-exposure", f"{sensor.exposure_ev:+.2f} stops"],
+        ["highlight shoulder", f"{sensor.shoulder:.2f}"],
+        ["photons at full scale", f"{sensor.photons:.0f}"],
+        ["read noise", f"{sensor.read_noise:.4f}"],
+        ["white balance", f"red {sensor.red_gain:.2f}, blue {sensor.blue_gain:.2f}"],
+        ["chroma smoothing", f"{sensor.chroma_px:.2f} px"],
+        ["sharpening", f"{sensor.sharpen:.2f} at {sensor.sharpen_px:.2f} px"],
+        ["JPEG inside the camera", "none" if sensor.jpeg_quality is None else f"quality {sensor.jpeg_quality}"],
     ]
 
 

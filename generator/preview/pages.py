@@ -40,7 +40,7 @@ def refuse_others(folder: Path) -> None:
     page = folder / PAGE_FILE
     files = [path for path in sorted(folder.rglob("*")) if path.is_symlink() or not path.is_dir()]
     if not folder.is_dir() or (files and not page.is_file()) or (page.is_file() and _MARK not in _text(page)):
-        raise UserError(f"{folder}: exists already and is no preview; give a new or an empty folder")
+        raise UserError(f"{folder}: exists already and is not a preview; give a new or an empty folder")
     for path in files:
         name = path.relative_to(folder).as_posix()
         if path.is_symlink() or not (name in _FILES or _DATA_FILE.fullmatch(name)):

@@ -168,7 +168,7 @@ def sphere_plot(of: ClassStatistics) -> bytes:
 
 
 def _short(name: str) -> str:
-    """A name that ends as it ended: files are told apart by their last letters as often as by their first."""
+    """A name with its middle left out: files differ in their last letters as often as in their first."""
     half = _LONGEST_NAME // 2
     return name if len(name) <= _LONGEST_NAME else f"{name[: half - 1]}…{name[-half:]}"
 

@@ -50,11 +50,13 @@ MANY_TURNS = 72  # a C_n of at least this order is probably a solid of revolutio
 _CYCLIC_DEG = {6: 2.0, 12: 0.75}  # how far off a C_n up to an order may be
 _OTHER_DEG = {6: 1.0}  # likewise a D_n, T, O or I
 _FIELDS = ("symmetries_discrete", "symmetries_continuous")
+_MOST_LISTED = 1000  # rotations, repeated ones included
 _POLYHEDRAL = (GroupName("T", 0), GroupName("O", 0), GroupName("I", 0))
 _ACROSS = float(np.cos(np.radians(45)))
 _NEW_AXIS = float(np.cos(np.radians(5)))
 _MATCHED_DEG = 3.0  # angles of rotations and between axes that may be the same, when a frame is first sought
 _TRIED = 20  # rotations that first frames are judged by
+_WRITE_A_TABLE = "write the group into a symmetry table instead, for example {group: C4, axis: [0, 0, 1]}"
 _AMONG_EQUALS = normalise([1.0, 3.1e-3, 4.7e-3, 2.3e-3])  # chooses between frames that are equally near the identity
 
 
@@ -105,7 +107,10 @@ def recognise(info: Mapping[str, Any]) -> Recognised:
         raise UserError(f"{shown(info)} is not an entry of models_info.json, which maps field names to values")
     refuse_misspelt(info, _FIELDS)
     lines = [_line(item, i) for i, item in enumerate(_listed(info, "symmetries_continuous"))]
-    motions = [_motion(item, i) for i, item in enumerate(_listed(info, "symmetries_discrete"))]
+    discrete = _listed(info, "symmetries_discrete")
+    if len(discrete) > _MOST_LISTED:
+        raise UserError(f"symmetries_discrete lists {len(discrete)} rotations; a finite group has at most {MAX_ORDER}")
+    motions = [_motion(item, i) for i, item in enumerate(discrete)]
     if lines:
         (name, frame), misfit = _continuous(lines, motions), 0.0
     else:
@@ -318,9 +323,6 @@ def _normaliser(name: GroupName) -> GroupName:
     if name.family == "D":
         return GroupName("D", 2 * name.n) if name.n > 2 else GroupName("O", 0)
     return GroupName("I" if name.family == "I" else "O", 0)
-
-
-_WRITE_A_TABLE = "write the group into a symmetry table instead, for example {group: C4, axis: [0, 0, 1]}"
 
 
 def _no_group(given: Floats, placements: Sequence[Placement]) -> str:

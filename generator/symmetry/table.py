@@ -236,7 +236,7 @@ def _by_id(objects: object, otherwise: str) -> dict[int, Any]:
         raise UserError(otherwise)
     by_id: dict[int, Any] = {}
     for key, value in objects.items():
-        obj_id = _object_id(key)
+        obj_id = object_id(key)
         if obj_id in by_id:
             raise UserError(f"object {obj_id} is listed twice")
         by_id[obj_id] = value
@@ -309,7 +309,12 @@ def _agree(a: object, b: object) -> bool:
     return left.shape == right.shape and bool(np.allclose(left, right, atol=1e-9))
 
 
-def _object_id(key: object) -> int:
+def object_id(key: object) -> int:
+    """The id in `26`, `object 26` or `obj_000026`.
+
+    Raises:
+        UserError: there is none.
+    """
     matched = _OBJECT_KEY.fullmatch(str(key).strip())
     if matched is None:
         raise UserError(f"{key!r} names no object: write 'object 26' or 26{_suggestion(str(key), TABLE_KEYS)}")

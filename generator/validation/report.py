@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 Kind = Literal[
     "missing",  # a file, an image or an export member that should be there
     "stray",  # a file that belongs to nothing
-    "unreadable",  # cut off, damaged, or no JSON or image at all
+    "unreadable",  # cut off, damaged, or neither JSON nor an image
     "schema",  # JSON of another form
     "ids",  # files that disagree about which images and instances there are
     "counts",  # dataset.json's totals
@@ -19,18 +19,17 @@ Kind = Literal[
     "models",  # models/ against dataset.json and models_info.json
     "symmetries",  # symmetries.json itself
     "camera",  # cameras against the recipe and against scene_spec.jsonl
-    "pose",  # poses that are none, or that scene_spec.jsonl contradicts
+    "pose",  # invalid poses, or poses that scene_spec.jsonl contradicts
     "spec",  # scene_spec.jsonl against the plan and scene_gt.json
     "record",  # .records/ against the JSON files that were assembled from them
     "gt_info",  # counts, fractions and boxes
-    "mask",  # masks against each other
-    "depth",  # depth against poses, masks and the table
-    "geometry",  # normals and object coordinates
+    "mask",  # masks against each other and against recomputed ones
+    "depth",  # depth against recomputed depth
+    "geometry",  # normals and object coordinates against recomputed ones
     "coco",  # scene_gt_coco.json
     "canonical",  # labels that do not follow from poses and symmetries
     "stale",  # labels of other symmetries
     "export",  # an export that differs from its source
-    "deep",  # what casting the rays again contradicts
 ]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
@@ -104,7 +103,7 @@ class Report:
     Attributes:
         root: the dataset's folder.
         images, instances: how many were looked at.
-        deep_images: of how many the rays were cast again.
+        recomputed_images: how many were made again from the recorded scenes and compared, apart from their light.
         exports: what was compared with the dataset.
         findings: the first faults of each kind.
         counts: of all faults, by kind.
@@ -114,7 +113,7 @@ class Report:
     root: Path
     images: int
     instances: int
-    deep_images: int
+    recomputed_images: int
     exports: tuple[Path, ...]
     findings: tuple[Finding, ...]
     counts: dict[str, int]
@@ -134,11 +133,14 @@ class Report:
             if count > len(shown):
                 lines.append(f"{kind}: ... and {count - len(shown)} more")
         lines += [f"note: {note}" for note in self.notes]
-        deep = f", {self.deep_images} of them ray-cast again" if self.deep_images else ""
+        recomputed = f", {self.recomputed_images} of them recomputed" if self.recomputed_images else ""
         exports = f", {len(self.exports)} exports" if self.exports else ""
         faults = sum(self.counts.values())
         verdict = "valid" if self.valid else f"{faults} fault{'s' if faults > 1 else ''}"
-        return [*lines, f"{self.root}: {self.images} images{deep}, {self.instances} instances{exports}: {verdict}"]
+        return [
+            *lines,
+            f"{self.root}: {self.images} images{recomputed}, {self.instances} instances{exports}: {verdict}",
+        ]
 
     def to_json(self) -> dict[str, Any]:
         """For scripts: plain values."""
@@ -147,7 +149,7 @@ class Report:
             "valid": self.valid,
             "images": self.images,
             "instances": self.instances,
-            "deep_images": self.deep_images,
+            "recomputed_images": self.recomputed_images,
             "exports": [str(path) for path in self.exports],
             "counts": self.counts,
             "findings": [

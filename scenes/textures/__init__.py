@@ -10,6 +10,7 @@ from synthetless.scenes.textures.description import (
 )
 from synthetless.scenes.textures.families import FAMILIES
 from synthetless.scenes.textures.photos import list_photos, load_photo
+from synthetless.scenes.textures.seamless import seamless
 
 __all__ = [
     "FAMILIES",
@@ -20,5 +21,6 @@ __all__ = [
     "load_photo",
     "procedural_image",
     "sample_texture",
+    "seamless",
     "texture_from_json",
 ]

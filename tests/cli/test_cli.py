@@ -177,7 +177,8 @@ def test_no_summary_of_a_command_is_cut(run: Run, monkeypatch: pytest.MonkeyPatc
 
 def test_help_fits_eighty_columns(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    for command in ("generate", "preview", "validate", "relabel", "adopt", "fetch", "doctor", "render", "redo"):
+    names = ("generate", "preview", "validate", "relabel", "adopt", "fetch", "doctor", "render", "redo", "redevelop")
+    for command in names:
         _, out, _ = run(command, "--help")
         assert max(map(len, out.splitlines())) <= 80
 

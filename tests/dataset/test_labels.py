@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+from contextlib import nullcontext
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,8 +14,10 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from posed import random_camera, random_poses
 
-from synthetless.dataset.labels import box_corners_mm, label_scene
+from synthetless.dataset.labels import box_corners_mm, label_scene, undisturbed
 from synthetless.dataset.records import Entry
+from synthetless.errors import UserError
+from synthetless.io.files import atomic_write, locked
 from synthetless.symmetry import SymmetryTable
 
 BOX = {"min_x": -20, "min_y": -15, "min_z": -10, "size_x": 40, "size_y": 25, "size_z": 20.0, "diameter": 55.0}
@@ -121,3 +125,35 @@ def test_an_object_without_symmetries_is_told() -> None:
     gt, camera = _scene(1, [4])
     with pytest.raises(ValueError, match="is not in the symmetry table, which has objects 26"):
         label_scene(gt, camera, SymmetryTable({26: TABLE.entries[26]}), INFOS)
+
+
+def _rewrite(path: Path) -> None:
+    atomic_write(path, path.read_bytes())
+
+
+@pytest.mark.parametrize(
+    ("name", "may_grow", "refused"),
+    [
+        ("symmetries.json", False, True),
+        ("symmetries.json", True, True),
+        ("dataset.json", False, True),
+        ("dataset.json", True, False),
+        ("camera.json", False, False),
+    ],
+)
+def test_readers_notice_what_changes_under_them(tmp_path: Path, name: str, may_grow: bool, refused: bool) -> None:
+    for file in ("symmetries.json", "dataset.json", "camera.json"):
+        (tmp_path / file).write_text("{}")
+    expected = pytest.raises(UserError, match="is writing here, or was meanwhile") if refused else nullcontext()
+    with expected, undisturbed(tmp_path, may_grow):
+        _rewrite(tmp_path / name)
+
+
+def test_a_fault_that_a_writer_caused_is_not_told(tmp_path: Path) -> None:
+    """Not even to those who do not mind new images; a fault of the dataset's own is."""
+    with pytest.raises(UserError, match="is writing here"), locked(tmp_path), undisturbed(tmp_path, may_grow=True):
+        raise UserError("image 3 has no entry")
+    with pytest.raises(UserError, match="image 3 has no entry"), undisturbed(tmp_path):
+        raise UserError("image 3 has no entry")
+    with pytest.raises(UserError, match="is writing here"), locked(tmp_path, "1-of-2"), undisturbed(tmp_path):
+        pass

@@ -256,7 +256,7 @@ def test_folders_that_are_no_dataset_are_refused(valid: Path, tmp_path: Path) ->
             Dataset.open(place)
     with pytest.raises(UserError, match=rf"val: no such split; there are {SPLIT}"):
         Dataset.open(valid, "val")
-    with pytest.raises(UserError, match="train: no such split; this is no BOP dataset"):
+    with pytest.raises(UserError, match="train: no such split; this is not a BOP dataset"):
         Dataset.open(tmp_path / "empty", "train")
 
 

@@ -273,7 +273,7 @@ DAMAGE = {
     f"{SPLIT}/000002/scene_camera.json": r"000002/scene_camera\.json: not valid JSON, cut off or damaged",
     "dataset.json": r"dataset\.json: not valid JSON",
     "symmetries.json": r"symmetries\.json: ",
-    "models/models_info.json": r"models_info\.json: not a JSON object",
+    "models/models_info.json": r"models_info\.json: not valid JSON",
 }
 
 

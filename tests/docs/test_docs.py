@@ -422,3 +422,21 @@ def test_what_is_not_run_is_said_somewhere() -> None:
     lines = [command.line for block in found for command in commands(block)]
     for pattern, _ in NOT_RUN:
         assert any(re.fullmatch(pattern, line) for line in lines), pattern
+
+
+def test_the_files_that_the_architecture_names_exist() -> None:
+    text = PAGES["docs/architecture.md"].read_text(encoding="utf-8")
+    named = set(re.findall(r"`((?:generator|scenes|configs|tests|src)/[\w/.]+)`", text))
+    assert len(named) > 25
+    assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
+
+
+def test_what_a_step_of_a_walk_calls_is_in_its_file() -> None:
+    """In docs/architecture.md, a row "| `file.py` | `name` does something | ... |" names what that file defines."""
+    text = PAGES["docs/architecture.md"].read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `([\w/]+\.py)` \| (.+?) \|", text, re.MULTILINE)
+    assert len(rows) > 15
+    for file, step in rows:
+        source = (ROOT / file).read_text(encoding="utf-8")
+        for name in re.findall(r"`(?:\w+\.)*(\w+)(?:\(\))?`", step):
+            assert re.search(rf"\b{name}\b", source), f"{file}: {name}"

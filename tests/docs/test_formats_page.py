@@ -1,4 +1,4 @@
-"""docs/formats.md: the snippets that need packages which are seldom installed; tests/test_docs.py runs the others."""
+"""docs/formats.md: the snippets that need packages which are seldom installed; test_docs.py runs the others."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from synthetless.dataset.layout import SPLIT
+from synthetless.config import SPLIT
 
 CHECKOUT = "SYNTHETLESS_BOP_TOOLKIT"
 NAME, SPLIT_NAME, SPLIT_TYPE = "tless", *SPLIT.split("_")

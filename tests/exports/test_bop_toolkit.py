@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from synthetless.config import load_recipe
 from synthetless.dataset.layout import ScenePaths
-from synthetless.dataset.records import Entry, read_scene_json
+from synthetless.dataset.records import GtInfoEntry, read_scene_json
 from synthetless.exports.webdataset import export_webdataset
 from synthetless.generation.generate import Execution, generate
 from synthetless.io.files import read_json
@@ -32,12 +32,12 @@ RESULTS = f"truth_{NAME}-{SPLIT_NAME}-{SPLIT_TYPE}"
 
 @dataclass(frozen=True)
 class Compared:
-    """A dataset, and the copy whose masks, counts and boxes the toolkit has made anew."""
+    """A dataset, and the copy whose masks, counts and boxes the toolkit has computed again."""
 
     ours: ScenePaths
     theirs: ScenePaths
 
-    def instances(self) -> Iterator[tuple[int, int, Entry, Entry]]:
+    def instances(self) -> Iterator[tuple[int, int, GtInfoEntry, GtInfoEntry]]:
         """Image, instance, and both entries of scene_gt_info.json, of the big silhouettes."""
         theirs = read_scene_json(self.theirs.scene_gt_info)
         for im_id, infos in read_scene_json(self.ours.scene_gt_info).items():

@@ -122,7 +122,7 @@ def test_relabelling_refuses_shards_of_another_dataset(dataset: Path, tmp_path: 
     export_webdataset(copy, tmp_path / "web", workers=1)
     before = _bytes(tmp_path / "web")
     shutil.rmtree(ScenePaths.of(copy, 2).root)
-    with pytest.raises(ValueError, match="image 000002_000000 is only in the shards; export the dataset anew"):
+    with pytest.raises(ValueError, match="image 000002_000000 is only in the shards; export the dataset again"):
         relabel_webdataset(copy, tmp_path / "web")
     assert _bytes(tmp_path / "web") == before
     shard = tmp_path / "web" / "shard-000000.tar"

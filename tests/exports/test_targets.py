@@ -105,7 +105,7 @@ def test_a_free_name_is_written_and_written_again(copy: Path, place: str) -> Non
 def test_a_file_that_is_no_export_is_kept(copy: Path, tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "mine.json"
     path.write_bytes(content)
-    with pytest.raises(UserError, match=r"mine\.json: exists already and is no COCO export"):
+    with pytest.raises(UserError, match=r"mine\.json: exists already and is not a COCO export"):
         export_coco(copy, path)
     assert path.read_bytes() == content
 
@@ -119,7 +119,7 @@ def test_what_is_no_file_is_refused(copy: Path, tmp_path: Path, kind: str) -> No
         os.mkfifo(path)
     else:
         path = Path(os.devnull)
-    with pytest.raises(UserError, match="exists already and is no COCO export"):
+    with pytest.raises(UserError, match="exists already and is not a COCO export"):
         export_coco(copy, path)
 
 

@@ -180,6 +180,8 @@ REFUSED: dict[str, tuple[bytes, str]] = {
     ),
     "nan.ply": (_HEAD + _FACES + b"0 0 0\n1 nan 0\n0 1 0\n3 0 1 2\n", "vertex 1 is [1.0, nan, 0.0]"),
     "overflow.ply": (_HEAD + _FACES + b"0 0 0\n1 1e60 0\n0 1 0\n3 0 1 2\n", "vertex 1 is [1.0, inf, 0.0]"),
+    "beyond_all_parts.off": (off(BOX).replace(b"30.0", b"1e300"), "every coordinate must be finite"),
+    "saw.obj": (obj(prism([(0, 0), (30000, 0), *((x, 9 + x % 2) for x in range(20000, 0, -1))], 5)), "20002 corners"),
     "far_index.ply": (
         _HEAD + _FACES + _POINTS + b"3 0 1 3\n",
         "vertex 3, but there are only 3",
@@ -377,6 +379,11 @@ def test_what_is_written_is_what_was_read(name: str, tmp_path: Path) -> None:
     other = trimesh.load_mesh(tmp_path / "again.ply", process=False)
     np.testing.assert_array_equal(other.vertices, mesh.vertices_mm)
     np.testing.assert_array_equal(other.faces, mesh.faces)
+
+
+def test_line_ends_of_windows_are_no_reason_to_write_a_file_anew(tmp_path: Path) -> None:
+    assert _read(tmp_path, "windows.ply", ply(TRIANGLES, "\r\n")).is_verbatim
+    assert not _read(tmp_path, "old_mac.ply", ply(TRIANGLES, "\r")).is_verbatim
 
 
 @pytest.mark.parametrize("name", ["text_after.ply", "stray.ply", "latin1.ply", "spare_bytes.ply", "big_endian.ply"])

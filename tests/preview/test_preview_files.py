@@ -136,7 +136,7 @@ def test_a_preview_is_replaced_and_nothing_else(small_dataset: Path, tmp_path: P
     letters = tmp_path / "letters"
     letters.mkdir()
     (letters / "index.html").write_text("my own page")
-    with pytest.raises(ValueError, match="is no preview"):
+    with pytest.raises(ValueError, match="is not a preview"):
         write_preview(small_dataset, letters)
     assert (letters / "index.html").read_text() == "my own page"
 

@@ -94,7 +94,7 @@ def test_what_is_no_preview_is_kept(small_dataset: Path, tmp_path: Path, kind: s
         to.mkdir()
         (to / ("index.html" if "page" in kind else "letter")).write_text("mine")
     before = contents(tmp_path)
-    with pytest.raises(UserError, match="is no preview"):
+    with pytest.raises(UserError, match="is not a preview"):
         write_preview(small_dataset, to, limit=1)
     assert contents(tmp_path) == before
 
@@ -172,7 +172,10 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
     "view of another scene": (_spec(view=7), r"scene_spec\.jsonl: image 0 is not the one of scene_gt\.json"),
     "too few instances": (_spec(instances=[0]), "image 0 is not the one"),
     "unknown instances": (_spec(instances=[99] * 9), "image 0 is not the one"),
-    "damaged record": (_spec(exposure_gain="high"), r"scene_spec\.jsonl: exposure_gain: .* but it is .high."),
+    "damaged record": (
+        _spec(exposure_gain="high"),
+        r"scene_spec\.jsonl: exposure_gain is .*high.*: input should be a valid",
+    ),
     "no labels": (_without(f"{SCENE}/scene_gt_canonical.json"), r"scene_gt_canonical\.json: not found; adopt writes"),
     "no counts": (_without(f"{SCENE}/scene_gt_info.json"), r"scene_gt_info\.json: not found; bop_toolkit's"),
     "no models": (_without("models/models_info.json"), "holds no models_info.json in models, models_cad"),

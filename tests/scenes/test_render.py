@@ -20,7 +20,7 @@ from synthetless.io.models import ObjectModel, load_models
 from synthetless.scenes.render import BlenderSession
 from synthetless.scenes.rotations import matrix
 from synthetless.scenes.sampling import Catalogue, sample_scene
-from synthetless.scenes.settings import RenderSettings
+from synthetless.scenes.settings import RenderSettings, TableSettings
 from synthetless.scenes.spec import AmbientLight, Intrinsics, Material, Mesh, ObjectSpec, Pose, SceneSpec, View
 from synthetless.scenes.textures import ProceduralTexture
 
@@ -109,7 +109,7 @@ def test_pixels_and_poses_agree_for_any_camera(name: str, tmp_path: Path) -> Non
         {("model", key): Mesh(vertices / 1000, faces) for key, (vertices, faces) in meshes.items()},
         camera,
         RenderSettings(),
-        table_size_m=6.0,
+        TableSettings(),
         log=tmp_path / "log",
     )
     caster = RayCaster({("model", key): mesh for key, mesh in meshes.items()})
@@ -136,7 +136,7 @@ def _agreement_of_models(models: dict[int, ObjectModel], camera: Intrinsics, fol
         {("model", key): Mesh(model.vertices_mm / 1000, model.faces) for key, model in models.items()},
         camera,
         RenderSettings(),
-        table_size_m=6.0,
+        TableSettings(),
         log=folder / "log",
     )
     caster = scene_caster({"model": models})
@@ -171,7 +171,11 @@ def card_session(tmp_path: Path) -> BlenderSession:
     mesh = Mesh(np.array(card.vertices, dtype=np.float64), np.array(card.faces, dtype=np.int32))
     settings = RenderSettings(samples=64, denoiser="none", bounces=0)
     return BlenderSession(
-        {("model", 1): mesh}, Intrinsics(32, 32, 700, 700, 15.5, 15.5), settings, 0.5, log=tmp_path / "log"
+        {("model", 1): mesh},
+        Intrinsics(32, 32, 700, 700, 15.5, 15.5),
+        settings,
+        TableSettings(size_m=0.5),
+        log=tmp_path / "log",
     )
 
 

@@ -21,6 +21,7 @@ from synthetless.scenes.textures import (
     load_photo,
     procedural_image,
     sample_texture,
+    seamless,
     texture_from_json,
 )
 from synthetless.scenes.textures.layouts import courses, herringbone, hexagons, voronoi
@@ -322,3 +323,67 @@ def test_real_photographs_load(photo_textures: Path) -> None:
     for name in names:
         image = load_photo(photo_textures, name, max_size_px=512)
         assert image.ndim == 3 and max(image.shape) <= 512 and image.std() > 1
+
+
+# --- photographs made seamless ---
+
+
+def photograph(kind: str) -> NDArray[np.uint8]:
+    """Noise of every scale, or bricks, both brighter on the right and at the bottom."""
+    row, column = np.mgrid[:360, :360].astype(np.float64)
+    rng = np.random.default_rng(3)
+    if kind == "noise":
+        pattern = sum(
+            cv2.GaussianBlur(rng.standard_normal((360, 360)), (0, 0), sigma) * sigma for sigma in (1.0, 3.0, 9.0)
+        )
+        pattern = 20 * np.asarray(pattern)
+    else:
+        offset = 20 * (row // 25 % 2)
+        pattern = -60.0 * ((row % 25 < 3) | ((column + offset) % 40 < 3)) + rng.standard_normal((360, 360))
+    grey = 110 + pattern + 0.12 * column + 0.1 * row
+    return np.repeat(np.clip(grey, 0, 255)[..., None], 3, axis=2).astype(np.uint8)
+
+
+@pytest.mark.parametrize("kind", ["noise", "bricks"])
+def test_a_photograph_is_made_seamless(kind: str) -> None:
+    """The step across the border, with the gradient of the light evened out, is like the steps inside."""
+    before, tile = photograph(kind), seamless(photograph(kind))
+    assert tile.shape == (288, 288, 3)
+    for axis in (0, 1):
+        steps = steps_between_lines(tile)[axis]
+        assert steps[0] <= np.quantile(steps[1:], 0.98) * 1.05
+        assert steps[0] < 0.7 * steps_between_lines(before)[axis][0]
+
+
+@pytest.mark.parametrize("kind", ["noise", "bricks"])
+def test_a_seamless_photograph_is_that_photograph_without_mirrors(kind: str) -> None:
+    before, tile = photograph(kind), seamless(photograph(kind))
+    assert (tile[72:, 72:] == before[72:288, 72:288]).all(), "beyond the overlap nothing changes"
+    twice = np.tile(tile, (1, 2, 1)).astype(np.float64)[..., 0]
+    twice -= cv2.blur(twice, (61, 61))
+    for at in (144, 288, 432):
+        half = twice[:, at - 80 : at + 80]
+        similarity = np.corrcoef(half.ravel(), half[:, ::-1].ravel())[0, 1]
+        assert similarity < 0.75, "mirrored"
+
+
+def test_the_cut_lies_where_the_borders_differ_least() -> None:
+    """Where the overlap agrees along one line only, the seam is on it and nothing of the edges is blended."""
+    from synthetless.scenes.textures.seamless import _cheapest_path
+
+    cost = np.full((50, 40), 9.0, dtype=np.float32)
+    line = (20 + 5 * np.sin(np.arange(50) / 49 * 2 * np.pi)).round().astype(int)
+    cost[np.arange(50), line] = 0
+    assert (_cheapest_path(cost, is_closed=True) == line).all()
+    free = _cheapest_path(np.random.default_rng(0).random((50, 40), dtype=np.float32), is_closed=True)
+    assert free[0] == free[-1]
+    assert np.abs(np.diff(free)).max() <= 1
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (15, 400, 3), (16, 16, 3), (17, 300, 3), (40, 2048, 3)])
+def test_photographs_of_any_size_are_taken(shape: tuple[int, int, int]) -> None:
+    pixels = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
+    tile = seamless(pixels)
+    assert tile.dtype == np.uint8
+    assert min(tile.shape) >= 1
+    assert (tile == seamless(pixels)).all()

@@ -11,11 +11,12 @@ import pytest
 import trimesh
 from detect_shapes import box, cone, l_bracket
 
+from synthetless.errors import UserError
 from synthetless.io.files import read_json
 from synthetless.io.meshes import read_mesh
 from synthetless.io.models import find_meshes, load_models
 from synthetless.symmetry import SymmetryGroup, SymmetryTable
-from synthetless.symmetry.detection import DetectedFolder, detect_folder, report
+from synthetless.symmetry.detection import DetectedFolder, detect_folder, parse_tolerances, report
 
 L_BRACKET = SymmetryGroup.from_name("C2", axis=(1, 0, 1), offset_mm=(0, 10, 0))
 
@@ -215,3 +216,62 @@ def test_tless(tless_models: Path, tmp_path: Path) -> None:
     assert rocker.next_larger.residual.max_mm == pytest.approx(13.3, abs=0.2)
     assert square.answer.group == SymmetryGroup.from_name("C4")
     assert square.answer.residual.max_mm < 0.1
+
+
+@pytest.fixture
+def two_boxes(tmp_path: Path) -> Path:
+    """Two boxes 0.6 mm from being square prisms."""
+    for obj_id in (1, 26):
+        box(30, 30.6, 80).export(tmp_path / f"obj_{obj_id:06d}.ply")
+    return tmp_path
+
+
+def test_an_object_may_have_a_tolerance_of_its_own(two_boxes: Path, tmp_path: Path) -> None:
+    table = tmp_path / "tolerances.yaml"
+    table.write_text("object 26: 0.1 mm\n1: 2%")
+    for given, expected in (
+        ([], ["D4", "D4"]),
+        (["26=0.1mm"], ["D4", "D2"]),
+        (["26=0.1%", "1=0.2mm"], ["D2", "D2"]),
+        ([str(table)], ["D4", "D2"]),
+    ):
+        detected = detect_folder(two_boxes, workers=1, tolerances=parse_tolerances(given))
+        assert [o.detected.answer.group.name for o in detected.objects] == expected
+    assert "object 1: within 2 %\nobject 26: within 0.1 mm" in report(detected)
+    assert detected.objects[1].detected.tolerance_mm == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["26=0.5"], "26=0.5: the tolerance '0.5' is not a number above 0 with its unit, such as 0.5mm or 2%"),
+        (["26=0mm"], "not a number above 0"),
+        (["26=-1mm"], "not a number above 0"),
+        (["26=1e3mm"], "not a number above 0"),
+        (["26=1inch"], "not a number above 0"),
+        (["knob=1mm"], "'knob' names no object"),
+        (["26=1mm", "026=2mm"], "object 26 has two tolerances"),
+        (["none.yaml"], "none.yaml: not found"),
+        (["0.5mm"], "0.5mm: not found"),
+        (["7=1mm"], "object 7 has a tolerance, but .* holds objects 1, 26"),
+    ],
+)
+def test_wrong_tolerances_are_refused_in_one_line(two_boxes: Path, given: list[str], message: str) -> None:
+    with pytest.raises(UserError, match=message) as caught:
+        detect_folder(two_boxes, workers=1, tolerances=parse_tolerances(given))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("scale", "is_asked"), [(1 / 25.4, True), (0.1, True), (1.0, False), (1e-3, False)])
+def test_inches_and_centimetres_are_pointed_out(scale: float, is_asked: bool, tmp_path: Path) -> None:
+    """Parts of 3 to 10 mm could be parts of 3 to 10 inches; those in metres have a warning of their own."""
+    for obj_id, mesh in enumerate((box(30, 50, 80), box(60, 80, 150)), start=1):
+        mesh.apply_scale(scale)
+        mesh.export(tmp_path / f"obj_{obj_id:06d}.stl")
+    detected = detect_folder(tmp_path, workers=1)
+    text = " ".join(report(detected).split())
+    assert (
+        "are the units inches (--scale 25.4 turns them into millimetres) or centimetres (--scale 10)?" in text
+    ) == is_asked
+    assert (detected.to_json()["warning"] is not None) == is_asked
+    assert ("metres?" in text) == (scale == 1e-3)

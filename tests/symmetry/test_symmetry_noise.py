@@ -163,3 +163,9 @@ def test_only_what_is_asked_for_is_read(caplog: pytest.LogCaptureFixture) -> Non
     with pytest.raises(ValueError, match="object 2: symmetries_discrete is 'C2', not a list"):
         SymmetryTable.from_models_info(info)
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
+
+
+def test_long_lists_are_refused_by_their_length() -> None:
+    turns = from_axis_angle((0, 0, 1), 2 * np.pi * np.arange(1, 2000) / 2000)
+    with pytest.raises(ValueError, match="symmetries_discrete lists 1999 rotations; a finite group has at most 120"):
+        SymmetryGroup.from_bop(listed(turns))

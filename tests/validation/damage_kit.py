@@ -90,7 +90,7 @@ class Damage:
         kind: of the finding.
         file: the finding's, relative to the dataset.
         image, instance: the finding's.
-        deep: whether only casting the rays again can show it.
+        deep: whether only recomputing the image can show it.
     """
 
     name: str

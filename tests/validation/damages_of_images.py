@@ -167,7 +167,7 @@ def one_pixel_of_depth_off_by_half_a_millimetre(victim: Victim) -> None:
     victim.repaint(victim.depth, push)
 
 
-@damage("deep", _name("depth"), IMAGE, deep=True)
+@damage("depth", _name("depth"), IMAGE, WHOLE, deep=True)
 def dent_in_an_object(victim: Victim) -> None:
     visible = cv2.imread(str(victim.visible()), cv2.IMREAD_UNCHANGED) > 0
     core = cv2.erode(visible.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
@@ -264,7 +264,7 @@ def pixel_of_two_instances(victim: Victim) -> None:
     victim.repaint(victim.visible(HIDDEN), _add_pixel((np.max(others, axis=0) > 0) & (silhouette > 0)))
 
 
-@damage("depth", _name("depth"), IMAGE)
+@damage("mask", _name("mask_visib", WHOLE), IMAGE, WHOLE)
 def instance_declared_invisible(victim: Victim) -> None:
     """Consistently in every file: only the depth knows better."""
     empty = encode_mask(np.zeros((96, 128), dtype=bool))
@@ -276,7 +276,7 @@ def instance_declared_invisible(victim: Victim) -> None:
         content["annotations"] = [a for a in content["annotations"] if a["id"] != ids[WHOLE]]
 
 
-@damage("deep", _name("mask", HIDDEN), IMAGE, HIDDEN, deep=True)
+@damage("mask", _name("mask", HIDDEN), IMAGE, HIDDEN, deep=True)
 def mask_that_lacks_a_hidden_part(victim: Victim) -> None:
     """Pixels that nobody sees, taken away within the box and counted so."""
     visible = cv2.imread(str(victim.visible(HIDDEN)), cv2.IMREAD_UNCHANGED) > 0

@@ -93,6 +93,13 @@ def rotation_of_eight_numbers(victim: Victim) -> None:
         pose["cam_R_m2c"].pop()
 
 
+@damage("unreadable", "rgb/000001.png", IMAGE)
+def damaged_image_with_damaged_poses(victim: Victim) -> None:
+    """Entries that cannot be used must not keep the files of the image from being read."""
+    number_as_text(victim)
+    victim.rgb.write_bytes(victim.rgb.read_bytes()[:-9])
+
+
 @damage("unreadable", GT)
 def truncated_json(victim: Victim) -> None:
     data = victim.scene.scene_gt.read_bytes()

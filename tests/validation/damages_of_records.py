@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 from damage_kit import IMAGE, OTHER, WHOLE, Victim, damage
 
 from synthetless.dataset.layout import RECORDS_FOLDER
@@ -38,6 +40,38 @@ def record_that_lacks_its_counts(victim: Victim) -> None:
 @damage("unreadable", f"/{RECORD}", IMAGE)
 def record_that_is_a_list(victim: Victim) -> None:
     (victim.root / RECORD).write_text("[1, 2]")
+
+
+@damage("record", f"/{RECORD}", IMAGE)
+def record_of_another_scene(victim: Victim) -> None:
+    with victim.json(victim.root / RECORD) as record:
+        record["spec"]["scene"]["light"]["power_w"] = 1.0
+
+
+@damage("record", f"/{RECORD}", IMAGE)
+def record_without_an_annotation(victim: Victim) -> None:
+    with victim.json(victim.root / RECORD) as record:
+        record["coco"].pop()
+
+
+@damage("stray", f"/{RECORDS_FOLDER}/000001/000001 copy.json")
+def copy_of_a_record(victim: Victim) -> None:
+    shutil.copy(victim.root / RECORD, victim.root / RECORDS_FOLDER / "000001/000001 copy.json")
+
+
+@damage("stray", f"/{RECORDS_FOLDER}/000001/000003.json")
+def record_of_an_image_that_was_not_asked_for(victim: Victim) -> None:
+    shutil.copy(victim.root / RECORD, victim.root / RECORDS_FOLDER / "000001/000003.json")
+
+
+@damage("stray", f"/{RECORDS_FOLDER}/000001/.DS_Store")
+def record_of_a_file_manager(victim: Victim) -> None:
+    (victim.root / RECORDS_FOLDER / "000001/.DS_Store").write_bytes(b"Bud1")
+
+
+@damage("stray", f"/{RECORDS_FOLDER}/.DS_Store")
+def folder_of_records_of_a_file_manager(victim: Victim) -> None:
+    (victim.root / RECORDS_FOLDER / ".DS_Store").write_bytes(b"Bud1")
 
 
 # --- scene_spec.jsonl ---

@@ -15,10 +15,12 @@ from damage_kit import IMAGE, WHOLE, Victim
 from synthetless.dataset.labels import label_scene
 from synthetless.dataset.layout import ScenePaths
 from synthetless.dataset.records import read_scene_json, write_scene_json
+from synthetless.dataset.relabel import relabel
+from synthetless.io.files import locked
 from synthetless.io.images import encode_normals, encode_object_coordinates
 from synthetless.symmetry import SymmetryTable
 from synthetless.validation import Report, validate
-from synthetless.validation.scene import SceneTask, check_scene
+from synthetless.validation.run import SceneResult, SceneTask, check_scene
 
 EVERYTHING = "outputs=[rgb, depth, masks, normals, object_coordinates, exr]"
 MAKES = {
@@ -38,8 +40,8 @@ MAKES = {
 @pytest.mark.parametrize("overrides", MAKES.values(), ids=MAKES.keys())
 def test_every_make_of_dataset_is_valid(tmp_path: Path, parts: Path, overrides: tuple[str, ...]) -> None:
     valid_dataset.write_dataset(tmp_path / "d", parts, overrides)
-    report = validate(tmp_path / "d", deep=True, workers=1)
-    assert report.lines() == [f"{tmp_path / 'd'}: 6 images, 6 of them ray-cast again, 34 instances: valid"]
+    report = validate(tmp_path / "d", workers=1)
+    assert report.lines() == [f"{tmp_path / 'd'}: 6 images, 6 of them recomputed, 34 instances: valid"]
 
 
 @pytest.fixture(scope="module")
@@ -53,9 +55,9 @@ def cluttered(tmp_path_factory: pytest.TempPathFactory, parts: Path) -> tuple[Pa
 
 
 def test_distractors_hide_but_need_no_labels(cluttered: tuple[Path, Path]) -> None:
-    report = validate(cluttered[0], deep=True, workers=1)
+    report = validate(cluttered[0], workers=1)
     assert report.valid, report.lines()
-    assert report.deep_images == 6
+    assert report.recomputed_images == 6
     hidden = [
         info["visib_fract"]
         for entries in read_scene_json(ScenePaths.of(cluttered[0], 1).scene_gt_info).values()
@@ -68,12 +70,46 @@ def test_rays_that_cannot_be_cast_are_noted(cluttered: tuple[Path, Path]) -> Non
     dataset, balls = cluttered
     balls.rename(balls.with_name("elsewhere"))
     try:
-        report = validate(dataset, deep=True, workers=1)
+        report = validate(dataset, workers=1)
     finally:
         balls.with_name("elsewhere").rename(balls)
     assert report.valid
-    assert report.deep_images == 0
-    assert "6 images were not cast again" in report.notes[0]
+    assert report.recomputed_images == 0
+    assert "6 images could not be recomputed" in report.notes[0]
+
+
+def test_a_sample_is_spread_evenly_and_noted(valid: Path) -> None:
+    report = validate(valid, sample=2, workers=1)
+    assert report.valid and report.recomputed_images == 2
+    assert report.notes == ("2 of 6 images were recomputed, evenly spread; --deep recomputes every one",)
+    assert validate(valid, sample=None, workers=1).recomputed_images == 6
+
+
+def test_a_dataset_that_is_being_written_is_not_judged(valid: Path, tmp_path: Path) -> None:
+    root = tmp_path / "d"
+    shutil.copytree(valid, root)
+    with locked(root), pytest.raises(ValueError, match="another synthetless is writing here, or was meanwhile"):
+        validate(root, workers=1)
+    assert validate(root, workers=1).valid
+
+
+def test_a_dataset_that_was_relabelled_meanwhile_is_not_judged(
+    valid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between the reading of symmetries.json and that of the labels."""
+    root = tmp_path / "d"
+    shutil.copytree(valid, root)
+
+    def relabel_first(task: SceneTask) -> SceneResult:
+        relabel(root, scheme="atlas", workers=1)
+        return check_scene(task)
+
+    monkeypatch.setattr("synthetless.validation.run.check_scene", relabel_first)
+    with pytest.raises(ValueError, match="another synthetless is writing here, or was meanwhile"):
+        validate(root, workers=1)
+    monkeypatch.undo()
+    with valid_dataset.small_scene_folders():
+        assert validate(root, workers=1).valid
 
 
 def test_workers_find_the_same(valid: Path, tmp_path: Path) -> None:
@@ -82,9 +118,9 @@ def test_workers_find_the_same(valid: Path, tmp_path: Path) -> None:
     for scene_id in (1, 2):
         with Victim(root).entry("gt", WHOLE, scene_id) as pose:
             pose["cam_t_m2c"][0] += 1
-    alone = validate(root, deep=True, workers=1)
+    alone = validate(root, workers=1)
     assert not alone.valid
-    assert validate(root, deep=True, workers=2) == alone
+    assert validate(root, workers=2) == alone
 
 
 def test_folders_in_parts_are_found_the_same(valid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -94,14 +130,18 @@ def test_folders_in_parts_are_found_the_same(valid: Path, tmp_path: Path, monkey
         (root / f"train_synthetless/000001/rgb/{im_id:06d}.png").write_bytes(b"")
     with Victim(root).entry("gt", WHOLE, 1) as pose:
         pose["cam_t_m2c"][0] += 1
-    whole = validate(root, deep=True, workers=1)
+    whole = validate(root, workers=1)
     monkeypatch.setattr("synthetless.validation.run._IMAGES_WORTH_A_TASK", 1)
     tasks: list[SceneTask] = []
     monkeypatch.setattr("synthetless.validation.run.check_scene", lambda task: tasks.append(task) or check_scene(task))
-    parts = validate(root, deep=True, workers=1)
+    parts = validate(root, workers=1)
     assert [(task.scene_id, task.part, task.parts) for task in tasks] == [(1, 0, 2), (1, 1, 2), (2, 0, 2), (2, 1, 2)]
     assert set(parts.findings) == set(whole.findings) and len(parts.findings) == len(whole.findings) > 3
-    assert (parts.images, parts.instances, parts.deep_images) == (whole.images, whole.instances, whole.deep_images)
+    assert (parts.images, parts.instances, parts.recomputed_images) == (
+        whole.images,
+        whole.instances,
+        whole.recomputed_images,
+    )
 
 
 def test_a_report_keeps_a_few_faults_of_each_kind_and_counts_all(valid: Path, tmp_path: Path) -> None:
@@ -116,7 +156,7 @@ def test_a_report_keeps_a_few_faults_of_each_kind_and_counts_all(valid: Path, tm
     lines = report.lines()
     assert f"missing: ... and {n_masks - 3} more" in lines
     assert "unreadable: train_synthetless/000002/rgb/000000.png, image 0: is empty: zero bytes" in lines
-    assert lines[-1].endswith(f"6 images, 34 instances: {n_masks + 1} faults")
+    assert lines[-1].endswith(f"6 images, 6 of them recomputed, 34 instances: {n_masks + 1} faults")
     content = json.loads(json.dumps(report.to_json()))
     assert (content["valid"], content["counts"]["missing"]) == (False, n_masks)
     assert content["findings"][0] == {

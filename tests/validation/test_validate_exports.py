@@ -42,7 +42,7 @@ def test_exports_as_written_are_right(valid: Path, shards: Path, tmp_path: Path)
         kind: BoxKind = "visible" if boxes == "visible" else "amodal"
         export_coco(valid, exports[-1], boxes=kind)
     report = validate(valid, exports=exports, workers=1)
-    assert report.lines() == [f"{valid}: 6 images, 34 instances, 3 exports: valid"]
+    assert report.lines() == [f"{valid}: 6 images, 6 of them recomputed, 34 instances, 3 exports: valid"]
 
 
 def test_workers_compare_shards_alike(valid: Path, shards: Path, tmp_path: Path) -> None:
@@ -165,6 +165,23 @@ COCO: dict[str, tuple[Callable[[Any], Any], Place]] = {
     "category": (lambda c: _set(c["categories"][1], "name", "fuse"), ("export", "coco.json", None, None)),
     "duplicated id": (lambda c: _set(c["annotations"][7], "id", 9), ("export", "coco.json", 2, 1)),
     "no lists": (lambda c: c.pop("images"), ("schema", "coco.json", None, None)),
+    "a list that is none": (lambda c: _set(c, "annotations", 7), ("schema", "coco.json", None, None)),
+    "an annotation that is no object": (lambda c: _set(c["annotations"], 7, 5), ("schema", "coco.json", None, None)),
+    "an annotation that is null": (lambda c: _set(c["annotations"], 7, None), ("schema", "coco.json", None, None)),
+    "an annotation that is a list": (
+        lambda c: _set(c["annotations"], 7, [8]),
+        ("schema", "coco.json", None, None),
+    ),
+    "an image that is text": (lambda c: _set(c["images"], 1, "id"), ("schema", "coco.json", None, None)),
+    "an id that is a list": (lambda c: _set(c["images"][1], "id", [2]), ("schema", "coco.json", None, None)),
+    "an id that is text": (lambda c: _set(c["annotations"][7], "id", "8"), ("export", "coco.json", 2, 1)),
+    "an id that is null": (lambda c: _set(c["images"][1], "id", None), ("export", "coco.json", 2, None)),
+    "no height": (lambda c: _set(c["images"][1], "height", None), ("export", "coco.json", 2, None)),
+    "height as text": (lambda c: _set(c["images"][1], "height", "96"), ("export", "coco.json", 2, None)),
+    "a file name that is a number": (lambda c: _set(c["images"][1], "file_name", 3), ("export", "coco.json", 2, None)),
+    "a box that is null": (lambda c: _set(c["annotations"][7], "bbox", None), ("export", "coco.json", 2, 1)),
+    "no segmentation": (lambda c: _set(c["annotations"][7], "segmentation", None), ("export", "coco.json", 2, 1)),
+    "a category that is a number": (lambda c: _set(c["categories"], 1, 2), ("schema", "coco.json", None, None)),
 }
 
 

@@ -22,10 +22,10 @@ MODULES = (damages_of_images, damages_of_labels, damages_of_poses, damages_of_re
 
 
 def test_a_valid_dataset_has_no_finding(valid: Path) -> None:
-    report = validate(valid, deep=True, workers=1)
+    report = validate(valid, workers=1)
     assert report.lines()[:-1] == []
     assert report.valid
-    assert (report.images, report.deep_images) == (6, 6)
+    assert (report.images, report.recomputed_images) == (6, 6)
 
 
 def test_there_are_enough_damages() -> None:
@@ -40,8 +40,8 @@ def test_damage_is_found_in_its_place(valid: Path, tmp_path: Path, damage: Damag
     damage.act(Victim(root))
     if damage.deep:
         shutil.rmtree(root / RECORDS_FOLDER)  # they would betray it
-        assert validate(root, workers=1).valid, "only the rays tell"
-    report = validate(root, deep=damage.deep, workers=1)
+        assert validate(root, sample=0, workers=1).valid, "only recomputing tells"
+    report = validate(root, workers=1)
     places = [(f.kind, str(f.file.relative_to(root)), f.image, f.instance) for f in report.findings]
     assert (damage.kind, damage.file, damage.image, damage.instance) in places, report.lines()
 
@@ -103,4 +103,28 @@ def test_no_damage_is_too_much(valid: Path, tmp_path: Path, seed: int) -> None:
     values: list[Any] = [None, "", "x", -1, 0.5, 1e300, 10**30, [], {}, [1], {"a": 1}, True]
     node[key] = values[rng.integers(len(values))]
     path.write_text(json.dumps(content))
-    validate(root, deep=True, workers=1).lines()
+    validate(root, workers=1).lines()
+
+
+ODD_INFOS = ["{}", "[]", "null", "5", '{"1": 5}', '{"1": []}', '{"x": {}}', '{"1": {}}', '{"1": {"size_x": [30]}}', "{"]
+
+
+@pytest.mark.parametrize("text", ODD_INFOS)
+def test_an_odd_models_info_is_a_finding(valid: Path, tmp_path: Path, text: str) -> None:
+    root = tmp_path / "dataset"
+    shutil.copytree(valid, root)
+    (root / "models/models_info.json").write_text(text)
+    report = validate(root, workers=1)
+    assert "models_info.json" in "\n".join(report.lines())
+    assert (report.images, report.instances) == (6, 34)
+
+
+@pytest.mark.parametrize("key", ["size_x", "diameter", "symmetries_discrete", "symmetries_continuous"])
+@pytest.mark.parametrize("value", [[30], {}, "30", float("nan"), [[[]]], -1e400])
+def test_an_odd_value_of_an_object_is_a_finding(valid: Path, tmp_path: Path, key: str, value: Any) -> None:
+    root = tmp_path / "dataset"
+    shutil.copytree(valid, root)
+    with Victim(root).json(root / "models/models_info.json") as infos:
+        infos["2"][key] = value
+    found = [f for f in validate(root, workers=1).findings if f.file.name == "models_info.json"]
+    assert found and all(f.message.startswith("object 2") for f in found), found

@@ -19,6 +19,7 @@ PIECE = 0.03
 
 _NEIGHBOURS = 8
 _BLOCK = 8192
+_MOST_PIECES = 100_000  # about as many pieces as a surface is cut into beyond its triangles: no part needs as many
 _GRID = 112
 _NO_HEIGHT = 1e-9  # a triangle this flat, as a share of its longest edge, is a line: its neighbours cover it
 
@@ -60,7 +61,7 @@ class Surface:
         self.corners, self.areas = corners[solid], doubled[solid] / 2
         self.centroid: Floats = self.areas @ self.corners.mean(axis=1) / self.areas.sum()
         self._planar = _planar_form(self.corners)
-        pieces, self._parent = _cut(self.corners, piece)
+        pieces, self._parent = _cut(self.corners, max(piece, float(np.sqrt(self.areas.sum() / _MOST_PIECES))))
         centres = pieces.mean(axis=1)
         self._radius = float(np.linalg.norm(pieces - centres[:, None], axis=2).max())
         self._tree = cKDTree(centres, leafsize=32, balanced_tree=False, compact_nodes=False)  # the fastest queries

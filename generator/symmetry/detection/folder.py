@@ -2,22 +2,85 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Self
 
 import numpy as np
 
 from synthetless.errors import UserError
+from synthetless.io.documents import read_document, shown
 from synthetless.io.files import atomic_write, write_json
 from synthetless.io.meshes import read_mesh
 from synthetless.io.models import find_meshes
 from synthetless.io.parallel import each
 from synthetless.symmetry.atlas import SCHEMES, Scheme
-from synthetless.symmetry.detection.detect import Detected, GroupFit, detect
+from synthetless.symmetry.detection.detect import Detected, detect
+from synthetless.symmetry.detection.residual import GroupFit
 from synthetless.symmetry.groups import SymmetryGroup
-from synthetless.symmetry.table import MODELS_INFO_FILE, SymmetryEntry, SymmetryTable
+from synthetless.symmetry.table import MODELS_INFO_FILE, SymmetryEntry, SymmetryTable, object_id
+
+_TOLERANCE = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(mm|%)\s*")
+_SMALL_FOLDER_MM = 20.0  # of a folder whose largest part is smaller than this the units are asked about
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """What an object's largest residual may be.
+
+    Attributes:
+        value: a number above 0.
+        unit: millimetres, or % of the object's diameter.
+    """
+
+    value: float
+    unit: Literal["mm", "%"] = "%"
+
+    @classmethod
+    def parse(cls, text: object) -> Self:
+        """A tolerance such as `0.5mm` or `2%`.
+
+        Raises:
+            UserError: any other text, or nothing that is above 0.
+        """
+        matched = _TOLERANCE.fullmatch(str(text))
+        if matched is None or float(matched[1]) == 0:
+            raise UserError(f"the tolerance {shown(text)} is not a number above 0 with its unit, such as 0.5mm or 2%")
+        return cls(float(matched[1]), "mm" if matched[2] == "mm" else "%")
+
+    def percent_of(self, diameter_mm: float) -> float:
+        """As a share of the diameter, in %."""
+        return 100 * self.value / diameter_mm if self.unit == "mm" else self.value
+
+    def __str__(self) -> str:
+        return f"{self.value:g} {self.unit}"
+
+
+def parse_tolerances(texts: Iterable[str]) -> dict[int, Tolerance]:
+    """Tolerances of single objects, each written as `26=0.5mm` or as a YAML or JSON file that maps ids to tolerances.
+
+    Raises:
+        UserError: another form, an object twice, a file that cannot be read.
+    """
+    tolerances: dict[int, Tolerance] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        given: object = {key: value} if equals else read_document(Path(text))
+        if not isinstance(given, Mapping):
+            raise UserError(f"{text}: holds no tolerances; a mapping of object ids is needed, such as 26: 0.5mm")
+        for name, tolerance in given.items():
+            try:
+                obj_id = object_id(name)
+                parsed = Tolerance.parse(tolerance)
+            except UserError as error:
+                raise UserError(f"{text}: {error}") from None
+            if obj_id in tolerances:
+                raise UserError(f"{text}: object {obj_id} has two tolerances")
+            tolerances[obj_id] = parsed
+    return tolerances
+
 
 _SMALLEST_MM, _LARGEST_MM = 2.0, 2000.0
 
@@ -40,7 +103,9 @@ class DetectedObject:
 
     @property
     def warning(self) -> str | None:
-        """What is odd about its size, if anything."""
+        """What is odd about its size, if anything, or that time ran out."""
+        if not self.detected.is_complete:
+            return "took too long: not every group was looked at, and a larger one may fit; a simpler mesh takes less"
         diameter_mm, ask = self.detected.diameter_mm, "are its units"
         if diameter_mm < _SMALLEST_MM:
             return f"is only {diameter_mm:.3g} mm across: {ask} metres? (--scale 1000 turns them into millimetres)"
@@ -59,6 +124,7 @@ class DetectedFolder:
         are_numbered: whether the ids are only the files' places in alphabetical order.
         tolerance_percent: what the largest residual may be, as a share of the diameter.
         scale: what the files' coordinates were multiplied by to get millimetres.
+        tolerances: of objects that have another one.
     """
 
     folder: Path
@@ -66,6 +132,18 @@ class DetectedFolder:
     are_numbered: bool
     tolerance_percent: float
     scale: float
+    tolerances: Mapping[int, Tolerance] = field(default_factory=dict)
+
+    @property
+    def unit_warning(self) -> str | None:
+        """What is odd about all parts together, if anything: parts in inches or centimetres look like small ones."""
+        largest = max(o.detected.diameter_mm for o in self.objects)
+        if largest >= _SMALL_FOLDER_MM or any(o.warning for o in self.objects):
+            return None
+        return (
+            f"no part is larger than {largest:.3g} mm: are the units inches (--scale 25.4 turns them into millimetres) "
+            "or centimetres (--scale 10)?"
+        )
 
     def table(self, scheme: Scheme = SCHEMES[0]) -> SymmetryTable:
         """The detected groups as a symmetry table."""
@@ -77,6 +155,7 @@ class DetectedFolder:
             "folder": str(self.folder),
             "tolerance_percent": self.tolerance_percent,
             "scale": self.scale,
+            "warning": self.unit_warning,
             "objects": [_object_json(o) for o in self.objects],
         }
 
@@ -108,6 +187,7 @@ def detect_folder(
     tolerance_percent: float = 1.0,
     scale: float = 1.0,
     workers: int | None = None,
+    tolerances: Mapping[int, Tolerance] | None = None,
 ) -> DetectedFolder:
     """Detect the symmetry group of every mesh in a folder.
 
@@ -119,28 +199,34 @@ def detect_folder(
         scale: what the files' coordinates are to be multiplied by to give millimetres.
         workers: processes; one per available core if None. They are spawned: a script that calls this needs
             ``if __name__ == "__main__"``.
+        tolerances: of objects that have another one.
 
     Raises:
-        UserError: wrong numbers, a folder without meshes, a mesh that is unusable; with the file's name.
+        UserError: wrong numbers, a tolerance of an object that is not there, a folder without meshes, a mesh that is
+            unusable; with the file's name.
     """
     for name, value in (("tolerance_percent", tolerance_percent), ("scale", scale)):
         if not (np.isfinite(value) and value > 0):
             raise UserError(f"{name} is {value}; a number above 0 is needed")
     files = find_meshes(folder)
-    declared = _declared(folder)
+    declared, others = _declared(folder), dict(tolerances or {})
+    if strangers := sorted(others.keys() - files.paths.keys()):
+        known = ", ".join(map(str, files.paths))
+        raise UserError(f"object {strangers[0]} has a tolerance, but {folder} holds objects {known}")
     tasks = [
-        _Task(obj_id, path, tolerance_percent, scale, declared.get(obj_id)) for obj_id, path in files.paths.items()
+        _Task(obj_id, path, others.get(obj_id, Tolerance(tolerance_percent)), scale, declared.get(obj_id))
+        for obj_id, path in files.paths.items()
     ]
     tasks.sort(key=lambda task: -task.path.stat().st_size)  # the longest first, so that no core ends up alone
     objects = sorted(each(_detect_file, tasks, workers, "symmetries", "mesh"), key=lambda o: o.obj_id)
-    return DetectedFolder(folder, tuple(objects), files.are_numbered, tolerance_percent, scale)
+    return DetectedFolder(folder, tuple(objects), files.are_numbered, tolerance_percent, scale, others)
 
 
 @dataclass(frozen=True)
 class _Task:
     obj_id: int
     path: Path
-    tolerance_percent: float
+    tolerance: Tolerance
     scale: float
     declared: SymmetryGroup | None
 
@@ -150,7 +236,8 @@ def _detect_file(task: _Task) -> DetectedObject:
     if mesh.is_flat:
         raise UserError(f"{task.path}: all its points lie in one plane; a part with a thickness is needed")
     try:
-        detected = detect(mesh.vertices_mm, mesh.faces, mesh.diameter_mm, task.tolerance_percent, task.declared)
+        percent = task.tolerance.percent_of(mesh.diameter_mm)
+        detected = detect(mesh.vertices_mm, mesh.faces, mesh.diameter_mm, percent, task.declared)
     except ValueError as error:
         raise UserError(f"{task.path}: {error}") from error
     return DetectedObject(task.obj_id, task.path, mesh.bop_info(), detected)
@@ -178,6 +265,7 @@ def _object_json(o: DetectedObject) -> dict[str, Any]:
         "diameter_mm": found.diameter_mm,
         "tolerance_mm": found.tolerance_mm,
         "warning": o.warning,
+        "is_complete": found.is_complete,
         "residuals": [_fit_json(f, found) for f in found.fits],
     }
 

@@ -24,11 +24,11 @@ from synthetless.io.meshes import TriangleMesh, read_mesh
 from synthetless.io.models import find_meshes
 from synthetless.io.parallel import each
 from synthetless.scenes.spec import Intrinsics
-from synthetless.symmetry.detection.detect import GroupFit, measure
+from synthetless.symmetry.detection.detect import measure
 from synthetless.symmetry.detection.distance import PIECE, Surface
 from synthetless.symmetry.detection.folder import DetectedFolder
 from synthetless.symmetry.detection.report import group_cells
-from synthetless.symmetry.detection.residual import moved, spread_elements
+from synthetless.symmetry.detection.residual import GroupFit, moved, spread_elements
 from synthetless.symmetry.groups import SymmetryGroup
 from synthetless.symmetry.quaternions import Floats, normalise
 from synthetless.symmetry.table import SymmetryTable
@@ -66,7 +66,7 @@ def draw_detected(detected: DetectedFolder, to: Path, workers: int | None = None
             scale=detected.scale,
             target=to / f"obj_{o.obj_id:06d}.png",
             title=f"object {o.obj_id}",
-            tolerance_percent=detected.tolerance_percent,
+            tolerance_percent=100 * o.detected.tolerance_mm / o.detected.diameter_mm,
             shown=tuple(f for f in (o.detected.answer, o.detected.next_larger) if f is not None),
         )
         for o in detected.objects

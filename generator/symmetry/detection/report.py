@@ -11,8 +11,9 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from synthetless.symmetry.atlas import SCHEMES, Scheme, smallest_margin_deg
-from synthetless.symmetry.detection.detect import Detected, GroupFit
+from synthetless.symmetry.detection.detect import Detected
 from synthetless.symmetry.detection.folder import DetectedFolder, DetectedObject
+from synthetless.symmetry.detection.residual import GroupFit
 from synthetless.symmetry.groups import SymmetryGroup
 from synthetless.symmetry.point_groups import parse_name
 from synthetless.symmetry.quaternions import Floats, rotate, to_matrix
@@ -71,6 +72,7 @@ def summary(detected: DetectedFolder) -> str:
     legend = [
         "residuals over all elements of the group: largest, 95th percentile, root mean square; % of the diameter",
         f"group: the largest one within {detected.tolerance_percent:g} %",
+        *(f"object {obj_id}: within {tolerance}" for obj_id, tolerance in sorted(detected.tolerances.items())),
     ]
     return "\n".join([text, "", *legend])
 
@@ -132,6 +134,8 @@ def _short(value: float, digits: int) -> str:
 
 def _remarks(detected: DetectedFolder) -> list[str]:
     lines = [f"warning: object {o.obj_id} ({o.path.name}) {o.warning}" for o in detected.objects if o.warning]
+    if detected.unit_warning:
+        lines.append(f"warning: {detected.unit_warning}")
     if detected.are_numbered:
         numbers = ", ".join(f"{o.obj_id} = {o.path.name}" for o in detected.objects)
         lines.append(f"not every file's name is an object id, so they are numbered in alphabetical order: {numbers}")

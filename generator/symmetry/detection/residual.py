@@ -17,6 +17,7 @@ from synthetless.symmetry.groups import SymmetryGroup
 from synthetless.symmetry.quaternions import (
     IDENTITY,
     Floats,
+    conjugate,
     from_axis_angle,
     minimal,
     multiply,
@@ -67,6 +68,14 @@ class _Pairs:
         return _Pairs(point, element, np.concatenate([self.weight, other.weight]))
 
 
+@dataclass(frozen=True)
+class GroupFit:
+    """A group fitted to a mesh, and how far the mesh is from having it."""
+
+    group: SymmetryGroup
+    residual: Residual
+
+
 class ResidualMeter:
     """Measures the residuals of groups on one mesh.
 
@@ -105,6 +114,19 @@ class ResidualMeter:
         pairs = self._some_pairs(group, _FEW_PAIRS)
         places = moved(group, self._points[pairs.point], pairs.element)
         return float(self._settled(self._surface.distance(places), places).max())
+
+    def worst_pairs(self, group: SymmetryGroup, n: int) -> tuple[Floats, Floats]:
+        """Points (k, 3) and elements (k, 4), in the group's standard frame: n spread ones and the worst."""
+        pairs = self._some_pairs(group, n).joined(self._worst(group))
+        frame = group.frame_wxyz
+        return self._points[pairs.point], multiply(multiply(conjugate(frame), pairs.element), frame)
+
+    def _worst(self, group: SymmetryGroup) -> _Pairs:
+        """The worst of many pairs, by deviation."""
+        pairs = self._some_pairs(group, len(self._points))
+        worse = self._pairs_of_bad_points(group, pairs, self._deviations(group, pairs))
+        worst = np.argsort(self._deviations(group, worse))[-_BAD_POINTS:]
+        return _Pairs(worse.point[worst], worse.element[worst], worse.weight[worst])
 
     def _deviations(self, group: SymmetryGroup, pairs: _Pairs) -> Floats:
         return self._surface.distance(moved(group, self._points[pairs.point], pairs.element))

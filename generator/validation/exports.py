@@ -1,24 +1,35 @@
-"""Shards against the dataset they were made from, member by member."""
+"""Exports against the dataset they were made from: shards member by member, a COCO file by its ids."""
 
 from __future__ import annotations
 
 import json
 import tarfile
+import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pycocotools import mask as coco_mask
+
 from synthetless.dataset.layout import DATASET_FILE, SYMMETRIES_FILE, ScenePaths
 from synthetless.dataset.records import uncompressed_rle
+from synthetless.exports.coco import export_coco
 from synthetless.exports.webdataset import KEYS_FILE
 from synthetless.io.files import read_bytes, read_json
 from synthetless.io.images import decode_mask
-from synthetless.validation.labels import SceneLabels
+from synthetless.validation.records import SceneRecords
 from synthetless.validation.report import Finding, Tally, unusable
-from synthetless.validation.source import Source
+from synthetless.validation.structure import Source
 
 _SHARDS = f"shard-{'[0-9]' * 6}.tar"
+_LISTS = ("images", "annotations", "categories")
+
+ById = dict[str, dict[int, dict[str, Any]]]
+"""Items of a COCO file's lists, by the list's name and their ids."""
+
+
+# Webdataset shards
 
 
 @dataclass(frozen=True)
@@ -106,33 +117,35 @@ def by_scene(shards: Shards, scenes: set[int]) -> tuple[dict[int, dict[str, dict
         if scene.isdecimal() and image.isdecimal() and int(scene) in result:
             result[int(scene)][key] = members
         else:
-            shard = next(iter(members.values())).shard
-            findings.append(Finding("export", shard, f"has the image {key}, which the dataset does not have"))
+            findings.append(_stranger(key, members))
     return result, findings
 
 
 def check_shards(task: ShardsTask) -> Tally:
     """Compare the images of one scene folder."""
     tally = Tally(task.limit)
-    labels = SceneLabels.read(task.source.scene(task.scene_id))
-    keys = {f"{task.scene_id:06d}_{im_id:06d}": im_id for im_id in labels.gt}
-    for key in sorted(task.members.keys() - keys.keys()):
-        shard = next(iter(task.members[key].values())).shard
-        tally.add([Finding("export", shard, f"has the image {key}, which the dataset does not have")])
+    scene = SceneRecords.read(task.source.scene(task.scene_id))
+    keys = {f"{task.scene_id:06d}_{im_id:06d}": im_id for im_id in scene.gt}
+    tally.add(_stranger(key, task.members[key]) for key in sorted(task.members.keys() - keys.keys()))
     for key, im_id in keys.items():
-        tally.add(_check_image(task, labels, key, im_id))
+        tally.add(_check_image(task, scene, key, im_id))
     return tally
 
 
-def _check_image(task: ShardsTask, labels: SceneLabels, key: str, im_id: int) -> Iterator[Finding]:
+def _stranger(key: str, members: Mapping[str, Member]) -> Finding:
+    shard = next(iter(members.values())).shard
+    return Finding("export", shard, f"has the image {key}, which the dataset does not have")
+
+
+def _check_image(task: ShardsTask, scene: SceneRecords, key: str, im_id: int) -> Iterator[Finding]:
     members = task.members.get(key)
     if members is None:
         yield Finding("export", task.folder, f"no shard has the image {key}", im_id)
         return
     shard = next(iter(members.values())).shard
-    contents = _labels(labels, im_id)
-    files = _files(task.source, labels.paths, im_id)
-    masks = _masks(labels.paths, im_id, len(labels.gt[im_id])) if task.source.has("masks") else {}
+    contents = _contents(scene, im_id)
+    files = _files(task.source, scene.paths, im_id)
+    masks = _masks(scene.paths, im_id, len(scene.gt[im_id])) if task.source.has("masks") else {}
     expected = contents.keys() | files.keys() | masks.keys()
     for name in sorted(expected ^ members.keys()):
         state = "is missing" if name in expected else "has no source in the dataset"
@@ -150,12 +163,12 @@ def _check_image(task: ShardsTask, labels: SceneLabels, key: str, im_id: int) ->
             yield from _compare_masks(shard, f"{key}.{name}", im_id, _parsed(data), masks[name])
 
 
-def _labels(labels: SceneLabels, im_id: int) -> dict[str, Any]:
+def _contents(scene: SceneRecords, im_id: int) -> dict[str, Any]:
     sources: dict[str, Mapping[int, Any]] = {
-        "camera.json": labels.camera,
-        "gt.json": labels.gt,
-        "gt_canonical.json": labels.canonical,
-        "gt_info.json": labels.gt_info,
+        "camera.json": scene.camera,
+        "gt.json": scene.gt,
+        "gt_canonical.json": scene.canonical,
+        "gt_info.json": scene.gt_info,
     }
     return {name: content[im_id] for name, content in sources.items() if im_id in content}
 
@@ -189,7 +202,7 @@ def _compare_masks(shard: Path, name: str, im_id: int, content: Any, files: list
 def _parsed(data: bytes) -> Any:
     try:
         return json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
 
 
@@ -204,3 +217,82 @@ def _check_keys(path: Path, numbers: Mapping[str, int]) -> Iterator[Finding]:
         if listed.get(key) != numbers.get(key):
             message = f"has {key} in shard {listed.get(key)}; it is in shard {numbers.get(key)}"
             yield Finding("export", path, message)
+
+
+# COCO files
+
+
+def check_coco_export(source: Source, path: Path) -> Iterator[Finding]:
+    """Export anew, and compare."""
+    try:
+        content = read_json(path)
+        found: ById = {name: {item["id"]: dict(item) for item in content[name]} for name in _LISTS}
+    except (KeyError, TypeError):
+        yield Finding("schema", path, f"is no COCO file: it needs the lists {', '.join(_LISTS)}, of objects with ids")
+        return
+    except ValueError as error:
+        yield unusable(path, error)
+        return
+    for name in _LISTS:
+        if len(content[name]) != len(found[name]):
+            yield Finding("export", path, f"{len(content[name]) - len(found[name])} ids of its {name} occur twice")
+    try:
+        expected = _export(source)
+    except ValueError as error:
+        yield Finding("export", path, f"cannot be compared, the dataset cannot be exported: {error}")
+        return
+    _resolve(found["images"], path.parent)
+    _choose_boxes(found["annotations"], expected["annotations"])
+    for name in _LISTS:
+        yield from _compare(path, name, found[name], expected[name])
+
+
+def _export(source: Source) -> ById:
+    """What an export with amodal boxes says now, by id; files by their absolute paths."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "coco.json"
+        export_coco(source.root.resolve(), path, source.recipe.split, "amodal")
+        content = json.loads(path.read_bytes())
+        by_id: ById = {name: {item["id"]: item for item in content[name]} for name in _LISTS}
+        _resolve(by_id["images"], path.parent)
+    return by_id
+
+
+def _choose_boxes(found: Mapping[int, Any], expected: Mapping[int, Any]) -> None:
+    """Expect boxes of the visible parts instead, if more of the boxes found are those."""
+    visible = {number: coco_mask.toBbox(item["segmentation"]).tolist() for number, item in expected.items()}
+    boxes = {number: item.get("bbox") for number, item in found.items() if number in expected}
+    n_amodal = sum(box == expected[number]["bbox"] for number, box in boxes.items())
+    n_visible = sum(box == visible[number] for number, box in boxes.items())
+    if n_visible > n_amodal:
+        for number, item in expected.items():
+            item["bbox"] = visible[number]
+
+
+def _resolve(images: Mapping[int, dict[str, Any]], folder: Path) -> None:
+    for image in images.values():
+        image["file_name"] = str((folder / str(image.get("file_name"))).resolve())
+
+
+def _compare(path: Path, name: str, found: Mapping[int, Any], expected: Mapping[int, Any]) -> Iterator[Finding]:
+    for number in sorted(expected.keys() | found.keys(), key=str):
+        if number not in found:
+            yield Finding("export", path, f"{name}: id {number} is missing", *_place(name, expected[number]))
+        elif number not in expected:
+            yield Finding("export", path, f"{name}: id {number} is not in the dataset", *_place(name, found[number]))
+        else:
+            keys = [
+                key
+                for key in sorted(expected[number].keys() | found[number].keys())
+                if found[number].get(key) != expected[number].get(key)
+            ]
+            if keys:
+                message = f"{name}: id {number} differs from the dataset in {', '.join(keys)}"
+                yield Finding("export", path, message, *_place(name, expected[number]))
+
+
+def _place(name: str, item: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Image and instance of an item, numbered as in the file."""
+    if name == "images":
+        return (item["id"],)
+    return (item.get("image_id"), item.get("gt_id")) if name == "annotations" else ()
