@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import tarfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -22,12 +22,14 @@ from torch.utils.data import Dataset as TorchDataset
 from torch.utils.data import IterableDataset, get_worker_info
 
 from synthetless.annotation.instances import NO_BOX
-from synthetless.dataset.reader import Dataset, Image
+from synthetless.dataset.reader import Dataset, Image, read_specs
 from synthetless.errors import UserError
 from synthetless.io.images import decode_rgb
 from synthetless.learning.detector import Instances
 from synthetless.learning.stream import Crops
 from synthetless.learning.targets import LabelMaker, looking_at, turned, turning_homography
+from synthetless.scenes.sensor import capture
+from synthetless.scenes.settings import SensorSettings
 
 Floats = NDArray[np.float64]
 
@@ -96,10 +98,41 @@ class FolderImages(TorchDataset[Sample]):
         return int(self._ends[-1])
 
     def __getitem__(self, number: int) -> Sample:
+        return sample_of(self.image(number))
+
+    def image(self, number: int) -> Image:
+        """The image with a number, counted through all datasets."""
         if not 0 <= number < len(self):
             raise IndexError(f"image {number} of {len(self)}")
         of = int(np.searchsorted(self._ends, number, side="right")) - 1
-        return sample_of(self.datasets[of][number - int(self._ends[of])])
+        return self.datasets[of][number - int(self._ends[of])]
+
+
+class Photographs:
+    """Takes the images of folders anew, each time with another camera, from their linear light (outputs: exr)."""
+
+    def __init__(self, images: FolderImages, sensor: SensorSettings) -> None:
+        """Take those images with cameras drawn from the ranges of ``sensor``."""
+        self._images, self._sensor = images, sensor
+        self._gains: dict[Path, dict[int, float]] = {}
+
+    def sample(self, number: int, rng: np.random.Generator) -> Sample:
+        """The image with a number, with other pixels.
+
+        Raises:
+            UserError: its linear light is not there.
+        """
+        image = self._images.image(number)
+        pixels = capture(image.linear(), self._sensor, rng, self._gain(image))
+        return replace(sample_of(image), pixels=pixels)
+
+    def _gain(self, image: Image) -> float:
+        root = image.paths.root
+        if root not in self._gains:
+            self._gains[root] = {im_id: spec.exposure_gain for im_id, spec in read_specs(image.paths).items()}
+        if image.im_id not in self._gains[root]:
+            raise UserError(f"{root}: scene_spec.jsonl does not say how image {image.im_id} was exposed")
+        return self._gains[root][image.im_id]
 
 
 class ShardImages(IterableDataset[Sample]):

@@ -58,6 +58,8 @@ class DataSettings(Settings):
     """Pixels are multiplied by 1 plus or minus up to this."""
     noise: Annotated[float, Bounds(0, 100)] = 8.0
     """Largest standard deviation of the added noise, of 255."""
+    sensor: Literal["none", "ranges", "primesense"] = "none"
+    """Take every image anew with such a camera, from its linear light; the dataset needs the output exr."""
     workers: Annotated[int, Bounds(0, 256)] = 0
     """Processes that read images; 0: the training's own."""
 

@@ -19,12 +19,13 @@ from synthetless.dataset.reader import Dataset
 from synthetless.errors import UserError
 from synthetless.io.files import read_json, write_json
 from synthetless.io.models import load_models
-from synthetless.learning.data import FolderImages, SampleBatcher, picture
+from synthetless.learning.data import FolderImages, Photographs, SampleBatcher, picture
 from synthetless.learning.detector import Detector, Instances
 from synthetless.learning.fit import CHECKPOINT_FILE, LOG_FILE, Record, Schedule, fit, load, read_log
 from synthetless.learning.pages import Section, line_chart, write_page
 from synthetless.learning.settings import Training
 from synthetless.learning.targets import LabelMaker
+from synthetless.scenes.settings import SensorSettings
 from synthetless.symmetry import SymmetryTable
 
 RUN_FILE, PAGE_FILE = "run.json", "index.html"
@@ -174,11 +175,14 @@ class _Pictures(torch.utils.data.Dataset[tuple[Tensor, Instances]]):
 
     def __init__(self, images: FolderImages, batcher: SampleBatcher, training: Training) -> None:
         self._images, self._batcher, self._training = images, batcher, training
+        sensor = training.data.sensor
+        self._photographs = None if sensor == "none" else Photographs(images, SensorSettings(preset=sensor))
 
     def __getitem__(self, place: tuple[int, int]) -> tuple[Tensor, Instances]:
         step, number = place
-        sample, data = self._images[number], self._training.data
+        data = self._training.data
         rng = np.random.default_rng([self._training.seed, 6, step, number])
+        sample = self._images[number] if self._photographs is None else self._photographs.sample(number, rng)
         return picture(sample.pixels, rng, data.brightness, data.noise), self._batcher.instances(sample)
 
 

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 from packages import package_or_skip
+from valid_dataset import write_dataset
 
 torch = package_or_skip("torch", "extra 'learn' has it")
 
@@ -27,7 +28,7 @@ from synthetless.errors import UserError  # noqa: E402
 from synthetless.exports.webdataset import export_webdataset  # noqa: E402
 from synthetless.io.models import load_models  # noqa: E402
 from synthetless.learning.backbone import Backbone, EfficientNetLite0, imagenet_weights  # noqa: E402
-from synthetless.learning.data import FolderImages, SampleBatcher, ShardImages, crops_of, sample_of  # noqa: E402
+from synthetless.learning.data import FolderImages, Photographs, SampleBatcher, ShardImages, crops_of, sample_of  # noqa: E402
 from synthetless.learning.detector import Detections, Detector, Instances, _to_box_units, _to_pixels  # noqa: E402
 from synthetless.learning.fit import CHECKPOINT_FILE, load  # noqa: E402
 from synthetless.learning.operators import iou  # noqa: E402
@@ -37,6 +38,7 @@ from synthetless.learning.score import Judge, score  # noqa: E402
 from synthetless.learning.settings import Training  # noqa: E402
 from synthetless.learning.solve import solve_pose  # noqa: E402
 from synthetless.learning.train import PAGE_FILE, choose_device, read_parts, train  # noqa: E402
+from synthetless.scenes.settings import SensorSettings  # noqa: E402
 from synthetless.scenes.textures import ProceduralTexture, procedural_image  # noqa: E402
 
 TINY = (
@@ -109,6 +111,20 @@ def test_samples_say_what_the_dataset_says(valid: Path) -> None:
         mask = instance.mask_visib()
         x, y = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
         assert sample.boxes[row].tolist() == [x[0], y[0], x[-1], y[-1]]
+
+
+def test_images_are_taken_anew_from_their_light(parts: Path, tmp_path: Path, valid: Path) -> None:
+    """Other pixels with every generator, the same with the same; all else stays."""
+    write_dataset(tmp_path / "light", parts, ["images=2", "outputs=[rgb, depth, masks, exr]"])
+    images = FolderImages([tmp_path / "light"])
+    taken = [Photographs(images, SensorSettings()).sample(1, np.random.default_rng(seed)) for seed in (0, 0, 1)]
+    assert (taken[0].pixels == taken[1].pixels).all()
+    assert (taken[0].pixels != taken[2].pixels).any()
+    assert taken[0].pixels.shape == images[1].pixels.shape
+    assert (taken[0].R_m2c == images[1].R_m2c).all()
+    train(_training("schedule.steps=1", "data.sensor=ranges"), [tmp_path / "light"], tmp_path / "run", "cpu")
+    with pytest.raises(UserError, match="exr"):
+        Photographs(FolderImages([valid]), SensorSettings()).sample(0, np.random.default_rng(0))
 
 
 def test_shards_give_the_same_samples_whatever_the_workers(valid: Path, tmp_path: Path) -> None:
