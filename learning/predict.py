@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -11,9 +13,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from synthetless.dataset.reader import Dataset, Image
-from synthetless.io.files import atomic_write
-from synthetless.io.images import encode_png
+from synthetless.dataset.reader import Dataset, Image, Instance
+from synthetless.errors import UserError
+from synthetless.io.files import atomic_write, read_bytes, read_json
+from synthetless.io.images import decode_rgb, encode_png
 from synthetless.learning.data import picture, sample_of
 from synthetless.learning.detector import Detections, Detector
 from synthetless.learning.fit import CHECKPOINT_FILE, load, load_weights
@@ -27,6 +30,59 @@ Floats = NDArray[np.float64]
 _TRUE, _PREDICTED = (60, 200, 60), (230, 60, 40)
 _EDGES = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
 _SHOWN = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A picture to predict from, and the true poses, if they are known.
+
+    Attributes:
+        scene_id, im_id, key: which it is.
+        K: (3, 3) camera matrix.
+        read: its pixels (H, W, 3).
+        instances: what is in it.
+    """
+
+    scene_id: int
+    im_id: int
+    key: str
+    K: Floats
+    read: Callable[[], NDArray[np.uint8]]
+    instances: Sequence[Instance] = ()
+
+    @classmethod
+    def of(cls, image: Image) -> Picture:
+        """An image of a dataset."""
+        return cls(image.scene_id, image.im_id, image.key, image.K, image.rgb, image.instances)
+
+
+def pictures_of(source: Path, split: str | None = None, camera: Path | None = None) -> list[Picture]:
+    """The images of a BOP dataset, or of a folder of pictures, which are scene 0 and numbered by their names' order.
+
+    Args:
+        source: the folder.
+        split: of the dataset.
+        camera: BOP's camera.json (fx, fy, cx, cy), for a folder of pictures.
+
+    Raises:
+        UserError: it is neither; or a camera is missing or damaged.
+    """
+    if camera is None:
+        return [Picture.of(image) for image in Dataset.open(source, split)]
+    intrinsics = read_json(camera)
+    try:
+        fx, fy, cx, cy = (float(intrinsics[name]) for name in ("fx", "fy", "cx", "cy"))
+    except (KeyError, TypeError, ValueError):
+        raise UserError(f"{camera}: must have the numbers fx, fy, cx and cy, as BOP's camera.json") from None
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    paths = sorted(path for path in source.glob("*") if path.suffix.lower() in (".png", ".jpg", ".jpeg"))
+    if not paths:
+        raise UserError(f"{source}: holds no pictures (*.png, *.jpg)")
+    return [Picture(0, number, path.stem, K, partial(_read_picture, path)) for number, path in enumerate(paths)]
+
+
+def _read_picture(path: Path) -> NDArray[np.uint8]:
+    return decode_rgb(read_bytes(path), path)
 
 
 class Predictor:
@@ -53,7 +109,7 @@ class Predictor:
         parts = (found.boxes, found.classes, found.scores, found.corners_px, found.index)
         return Detections(*(part.cpu() for part in parts))
 
-    def estimates(self, image: Image, found: Detections, seconds: float) -> list[Estimate]:
+    def estimates(self, image: Picture, found: Detections, seconds: float) -> list[Estimate]:
         """Poses of the detections of an image; corners that have none are left out."""
         estimates = []
         for number in range(len(found.scores)):
@@ -67,25 +123,33 @@ class Predictor:
 
 
 def predict(
-    run: Path, dataset: Path, to: Path, overlays: Path | None = None, split: str | None = None, device: str = "auto"
+    run: Path,
+    source: Path,
+    to: Path,
+    overlays: Path | None = None,
+    split: str | None = None,
+    device: str = "auto",
+    camera: Path | None = None,
 ) -> int:
-    """Predict the poses in all images of a dataset.
+    """Predict the poses in all images of a dataset or folder.
 
     Args:
         run: folder of a training.
-        dataset: BOP dataset folder, of one's own, adopted or any other; only pictures and cameras are used.
+        source: BOP dataset folder, of one's own, adopted or any other, of which only pictures and cameras are used;
+            with ``camera`` a folder of pictures.
         to: result file to write.
         overlays: folder for a picture of each image with true (green) and predicted (red) boxes.
         split: of the dataset.
         device: as for training.
+        camera: see ``pictures_of``.
 
     Returns:
         How many poses were found.
     """
     predictor = Predictor(run, device)
     estimates: list[Estimate] = []
-    for image in Dataset.open(dataset, split):
-        pixels, started = image.rgb(), time.perf_counter()
+    for image in pictures_of(source, split, camera):
+        pixels, started = image.read(), time.perf_counter()
         found = predictor.detect(pixels)
         own = predictor.estimates(image, found, 0.0)
         seconds = time.perf_counter() - started
@@ -97,7 +161,7 @@ def predict(
     return len(estimates)
 
 
-def draw(pixels: NDArray[np.uint8], image: Image, estimates: Sequence[Estimate], parts: Parts) -> NDArray[np.uint8]:
+def draw(pixels: NDArray[np.uint8], image: Picture, estimates: Sequence[Estimate], parts: Parts) -> NDArray[np.uint8]:
     """The picture with the boxes of true poses (green) and of the surer estimates (red), as the paper's figures."""
     canvas = pixels.copy()
     for instance in image.instances:

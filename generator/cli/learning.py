@@ -179,12 +179,15 @@ def train_command(
 
 def predict_command(
     run: Annotated[Path, typer.Argument(help="Folder of a training.")],
-    dataset: Annotated[Path, typer.Argument(help="Folder of a BOP dataset: its pictures and cameras are used.")],
+    dataset: Annotated[Path, typer.Argument(help="Folder of a BOP dataset, whose pictures and cameras are used.")],
     to: Annotated[Path, typer.Option(metavar="FILE", help="BOP result file to write.")],
     overlays: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for pictures with true and predicted boxes.")
     ] = None,
     split: Split = None,
+    camera: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="BOP's camera.json, if DATASET is a plain folder of pictures.")
+    ] = None,
     device: Annotated[str, typer.Option(metavar="NAME", help="auto, cpu, cuda, ...")] = "auto",
 ) -> None:
     """Predict poses with a trained detector.
@@ -194,5 +197,5 @@ def predict_command(
     need_torch()
     from synthetless.learning.predict import predict
 
-    count = predict(run, dataset, to, overlays, split, device)
+    count = predict(run, dataset, to, overlays, split, device, camera)
     say(f"{count} poses in {to}")

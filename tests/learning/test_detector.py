@@ -32,7 +32,7 @@ from synthetless.learning.data import FolderImages, Photographs, SampleBatcher, 
 from synthetless.learning.detector import Detections, Detector, Instances, _to_box_units, _to_pixels  # noqa: E402
 from synthetless.learning.fit import CHECKPOINT_FILE, load  # noqa: E402
 from synthetless.learning.operators import iou  # noqa: E402
-from synthetless.learning.predict import Predictor, _average_precision, mean_average_precision, predict  # noqa: E402
+from synthetless.learning.predict import Picture, Predictor, _average_precision, mean_average_precision, predict  # noqa: E402
 from synthetless.learning.results import read_results, write_results  # noqa: E402
 from synthetless.learning.score import Judge, score  # noqa: E402
 from synthetless.learning.settings import Training  # noqa: E402
@@ -276,6 +276,22 @@ def test_predictions_are_a_result_file_that_can_be_scored(trained: Path, valid: 
     assert 0 <= found.average_recall <= 1
 
 
+def test_a_plain_folder_of_pictures_needs_a_camera(trained: Path, valid: Path, tmp_path: Path) -> None:
+    (tmp_path / "pictures").mkdir()
+    for image in Dataset.open(valid)[:2]:
+        shutil.copy(image.paths.rgb(image.im_id), tmp_path / "pictures" / f"{image.key}.png")
+    camera = tmp_path / "camera.json"
+    camera.write_text('{"fx": 300, "fy": 298, "cx": 63.2, "cy": 47.7}')
+    predict(trained, tmp_path / "pictures", tmp_path / "r.csv", tmp_path / "overlays", device="cpu", camera=camera)
+    assert {estimate.im_id for estimate in read_results(tmp_path / "r.csv")} <= {0, 1}
+    assert len(list((tmp_path / "overlays").iterdir())) == 2
+    camera.write_text('{"fx": 300}')
+    with pytest.raises(UserError, match="must have the numbers fx, fy, cx and cy"):
+        predict(trained, tmp_path / "pictures", tmp_path / "r.csv", camera=camera)
+    with pytest.raises(UserError, match="no BOP dataset"):
+        predict(trained, tmp_path / "pictures", tmp_path / "r.csv")
+
+
 class _Knowing(Predictor):
     """Says what is true, as a perfect detector would."""
 
@@ -296,7 +312,7 @@ def test_true_corners_score_as_the_truth_under_a_true_z(valid: Path, tmp_path: P
     knowing = _Knowing(valid)
     images = list(Dataset.open(valid))
     assert mean_average_precision(knowing, images) == pytest.approx(1)
-    estimates = [e for image in images for e in knowing.estimates(image, knowing.detect(image.rgb()), -1.0)]
+    estimates = [e for image in images for e in knowing.estimates(Picture.of(image), knowing.detect(image.rgb()), -1.0)]
     write_results(tmp_path / "true.csv", estimates)
     assert score(Judge(valid, true_z=True), tmp_path / "true.csv", workers=1).average_recall > 0.95
 
