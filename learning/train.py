@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Sampler
@@ -29,6 +30,8 @@ from synthetless.scenes.settings import SensorSettings
 from synthetless.symmetry import SymmetryTable
 
 RUN_FILE, PAGE_FILE = "run.json", "index.html"
+_FIXED_BYTES, _BYTES_PER_PIXEL = 200e6, 1000
+"""Of a step beside the network: measured at 256 to 640 pixels a side, default settings, float32."""
 _PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16}
 
 
@@ -227,7 +230,7 @@ def train(
         tell: gets every record of the log.
 
     Raises:
-        UserError: what ``read_parts``, ``write_run`` and ``fit`` refuse; a dataset is empty.
+        UserError: what ``read_parts``, ``write_run`` and ``fit`` refuse; a dataset is empty; too little memory is free.
     """
     images = FolderImages(data)
     if len(images) == 0:
@@ -235,6 +238,8 @@ def train(
     parts = read_parts(images.datasets, training.data.objects, models)
     batcher = SampleBatcher(parts.maker(training), parts.boxes_mm, parts.ids, training.data.min_visib_fract)
     with _processes(device) as (rank, place):
+        height, width, _ = images[0].pixels.shape
+        _refuse_little_memory(training.schedule.images_per_step * height * width, place)
         if rank == 0:
             write_run(run, training, parts)
         torch.manual_seed(training.seed)
@@ -271,6 +276,21 @@ def train(
         if rank == 0:
             write_training_page(run)
     return read_log(run)
+
+
+def _refuse_little_memory(pixels: int, device: torch.device) -> None:
+    """Before the first step, instead of being killed in it.
+
+    Raises:
+        UserError: less memory is free than a step of so many pixels took when it was measured.
+    """
+    free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else psutil.virtual_memory().available
+    needed = _FIXED_BYTES + _BYTES_PER_PIXEL * pixels
+    if free < needed:
+        raise UserError(
+            f"a step of {pixels:,} pixels needs about {needed / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; take a "
+            "smaller schedule.images_per_step"
+        )
 
 
 def _next_step(run: Path) -> int:

@@ -324,7 +324,9 @@ def test_average_precision() -> None:
     assert _average_precision([(0.9, True), (0.8, False), (0.7, True)], 4) == pytest.approx(0.25 + 0.25 * 2 / 3)
 
 
-def test_what_cannot_work_is_refused_before_it_starts(valid: Path, trained: Path, tmp_path: Path) -> None:
+def test_what_cannot_work_is_refused_before_it_starts(
+    valid: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(UserError, match="no mesh for object 99"):
         train(_training("data.objects=[99]"), [valid], tmp_path / "a", "cpu")
     with pytest.raises(UserError, match="no such dataset folder"):
@@ -333,6 +335,9 @@ def test_what_cannot_work_is_refused_before_it_starts(valid: Path, trained: Path
         train(_training("labels=true"), [valid], trained, "cpu")
     with pytest.raises(UserError, match="device 'cuda:99' cannot be used"):
         choose_device("cuda:99")
+    monkeypatch.setattr("synthetless.learning.train._BYTES_PER_PIXEL", 10**9)
+    with pytest.raises(UserError, match=r"a step of [\d,]+ pixels needs about .* GB are free"):
+        train(_training(), [valid], tmp_path / "a", "cpu")
     with pytest.raises(UserError, match="not found"):
         Predictor(tmp_path)
     with pytest.raises(RecipeError, match=r"unknown setting schedule\.step; did you mean schedule\.steps\?"):
