@@ -115,7 +115,7 @@ def read_foreign(root: Path, limit: int) -> tuple[Foreign, list[Finding]]:
     except ValueError:  # adopt was given another folder
         pass
     else:
-        infos, obj_ids, faults = read_infos(path)
+        infos, obj_ids, faults = read_infos(path, declared=False)
         findings += faults
     table = read_table(root, infos or (), findings)
     scenes = tuple(scene_folders(root, ("scene_gt.json", "scene_gt_canonical.json")))

@@ -145,7 +145,7 @@ def read_source(root: Path, header: Header) -> tuple[Source, list[Finding]]:
     """Read and check everything outside the scene folders."""
     findings: list[Finding] = []
     folder = root / MODELS_FOLDER
-    infos, obj_ids, faults = read_infos(folder / INFO_FILE)
+    infos, obj_ids, faults = read_infos(folder / INFO_FILE, declared=True)
     findings += faults
     models = _read_models(folder, infos, header.models_sha256, findings)
     for obj_id in sorted(obj_ids ^ header.models_sha256.keys()) if obj_ids else ():
@@ -200,8 +200,13 @@ def check_counts(root: Path, header: Header, images: int, instances: int) -> Ite
 # Models
 
 
-def read_infos(path: Path) -> tuple[dict[int, ModelInfo], frozenset[int], list[Finding]]:
-    """models_info.json: its entries of the right form, the ids of all its entries, and what is wrong with it."""
+def read_infos(path: Path, declared: bool) -> tuple[dict[int, ModelInfo], frozenset[int], list[Finding]]:
+    """models_info.json: its entries of the right form, the ids of all its entries, and what is wrong with it.
+
+    Args:
+        path: of the file.
+        declared: whether the symmetries that it declares must be groups; adopt may have been told others.
+    """
     try:
         infos = read_models_info(path.parent)
     except ValueError as error:
@@ -212,7 +217,7 @@ def read_infos(path: Path) -> tuple[dict[int, ModelInfo], frozenset[int], list[F
         bad = [
             Finding("schema", path, f"object {obj_id}: {fault.message}") for fault in schema_faults(ModelEntry, info)
         ]
-        findings += bad or _check_declared(path, obj_id, info)
+        findings += bad or (_check_declared(path, obj_id, info) if declared else [])
         if not bad:
             good[obj_id] = info
     return good, frozenset(infos), findings
