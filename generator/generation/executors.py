@@ -44,8 +44,10 @@ _DEATHS = 2
 """A drop over which so many workers died is given up."""
 _DEATHS_AT_START = 12
 """The run ends when so many workers have died while starting, one after the other, and none got through."""
-_START_LIMIT_S = 600.0
-"""A worker that has not started after so long counts as dead."""
+_START_LIMIT_S = 120.0
+"""A worker that has not started after so long is ended; OpenBLAS, for one, waits for ever where there is no memory."""
+_HANGS_AT_START = 2
+"""The run ends after so many of them, too."""
 _END_LIMIT_S = 10.0
 """How long a worker without work may take to end."""
 _TICK_S = 1.0
@@ -289,12 +291,12 @@ class _LocalPool:
             return None
         return DropResult(task, failure=f"its worker died ({why})", killed=True)
 
-    def _died_at_start(self, why: str, worker: _Worker) -> None:
-        self._deaths_at_start += 1
+    def _died_at_start(self, why: str, worker: _Worker, weight: int = 1) -> None:
+        self._deaths_at_start += weight
         if self._deaths_at_start >= _DEATHS_AT_START:
             words = worker.last_words()
             told = f"; {worker.log} ends: {words}" if words else "; they printed nothing"
-            raise BlenderError(f"{self._deaths_at_start} workers died while starting, the last one with {why}{told}")
+            raise BlenderError(f"workers die while starting, the last one with {why}{told}")
 
     def _give_up_hung(self) -> Iterator[DropResult]:
         now, limit_s = time.monotonic(), self._config.drop_limit_s
@@ -304,7 +306,8 @@ class _LocalPool:
                 yield DropResult(worker.task, failure=f"took longer than {limit_s:g} s")
             elif not worker.ready and now - worker.since > _START_LIMIT_S:
                 self._remove(worker)
-                self._died_at_start(f"no answer within {_START_LIMIT_S:g} s", worker)
+                weight = _DEATHS_AT_START // _HANGS_AT_START
+                self._died_at_start(f"no answer within {_START_LIMIT_S:g} s", worker, weight)
 
     def _remove(self, worker: _Worker, grace_s: float = 0.0) -> None:
         self._workers.remove(worker)

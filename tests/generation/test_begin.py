@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import threading
 import time
 from collections.abc import Callable, Generator
@@ -18,6 +19,7 @@ from synthetless.generation import generate as generation
 from synthetless.generation.executors import DropResult, DropTask
 from synthetless.generation.generate import Execution, generate, retry
 from synthetless.io.files import LockedError, in_turn, locked
+from synthetless.scenes.blender import BlenderError
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -133,3 +135,15 @@ def test_a_drop_that_is_not_there_is_not_retried(begun: Path, tmp_path: Path) ->
     with pytest.raises(ValueError, match=r"nothing/dataset\.json: not found"):
         retry(tmp_path / "nothing", 0)
     assert not (tmp_path / "nothing").exists()
+
+
+def test_workers_that_hang_while_starting_end_the_run(
+    recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A limit that no start can keep stands for the hanging."""
+    monkeypatch.setattr(executors, "_START_LIMIT_S", 0.0)
+    config = executors.WorkerConfig(recipe, tmp_path, threads=1, drop_limit_s=60.0)
+    told = r"^workers die while starting, the last one with no answer within 0 s; "
+    with pytest.raises(BlenderError, match=told):
+        list(executors.run([DropTask(0, ())], config, 2))
+    assert not multiprocessing.active_children()

@@ -16,8 +16,6 @@ import psutil
 import pytest
 from trees import data_files
 
-from synthetless.generation.executors import _DEATHS_AT_START
-
 pytestmark = [pytest.mark.blender, pytest.mark.timeout(1200)]
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -29,7 +27,7 @@ objects: {{count: [1, 4]}}
 render: {{samples: 1}}
 """
 KILLS_OF_RUNS, KILLS_AT_START = 2, 10
-TOO_LITTLE_BYTES = 400 * 2**20
+TOO_LITTLE_BYTES = 64 * 2**20
 """Address space in which Python starts, but not what a worker imports."""
 
 
@@ -134,9 +132,8 @@ def test_workers_without_memory_end_the_run_with_one_line(
     _limit_memory(process, 1000)
     code, line = _ended(process)
     assert code == 2
-    assert line.startswith(f"synthetless: {_DEATHS_AT_START} workers died while starting, the last one with exit code ")
-    assert f"{out}/.logs/worker-" in line
-    assert "ends: " in line
+    assert line.startswith("synthetless: workers die while starting, the last one with ")
+    assert "ends: " in line or "printed nothing" in line
     process = _start(recipe, out, "--workers", "2")
     _limit_memory(process, 3)
     assert _ended(process) == (0, ""), "the others get their memory, and the run continues"
