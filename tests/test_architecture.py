@@ -9,7 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = {"generator": "synthetless", "scenes": "synthetless.scenes", "assets": "synthetless.assets"}
+FOLDERS = {
+    "generator": "synthetless",
+    "scenes": "synthetless.scenes",
+    "assets": "synthetless.assets",
+    "learning": "synthetless.learning",
+}
 
 FLOORS = (
     {"errors", "assets"},
@@ -21,6 +26,7 @@ FLOORS = (
     {"dataset"},
     {"generation", "exports"},
     {"validation", "preview", "fetch", "doctor"},
+    {"learning"},
     {"cli"},
     {"__main__"},
 )
