@@ -28,6 +28,7 @@ import trimesh
 import yaml
 
 from docs.figures.tless import overlay
+from tests.test_architecture import FLOORS
 
 if find_spec("bpy") is None:
     pytest.skip("the documentation's commands need Blender, extra 'blender'", allow_module_level=True)
@@ -440,3 +441,10 @@ def test_what_a_step_of_a_walk_calls_is_in_its_file() -> None:
         source = (ROOT / file).read_text(encoding="utf-8")
         for name in re.findall(r"`(?:\w+\.)*(\w+)(?:\(\))?`", step):
             assert re.search(rf"\b{name}\b", source), f"{file}: {name}"
+
+
+def test_the_architecture_s_floors_are_those_that_imports_are_held_to() -> None:
+    text = PAGES["docs/architecture.md"].read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\d+) \| (`.+?`) \|", text, re.MULTILINE)
+    told = {name: int(floor) for floor, names in rows for name in re.findall(r"`(\w+)/?`", names)}
+    assert told == {room: number for number, rooms in enumerate(FLOORS, start=1) for room in rooms}
