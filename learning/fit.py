@@ -105,7 +105,7 @@ def fit(
             parts = losses(step)
         total = torch.stack(list(parts.values())).sum()
         if not torch.isfinite(total):
-            raise UserError(f"step {step}: the loss is {float(total)}; take a lower learning rate")
+            raise UserError(f"step {step}: the loss is {total.item()}; take a lower learning rate")
         optimizer.zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(parameters, schedule.clip)
