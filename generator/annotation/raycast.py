@@ -348,8 +348,12 @@ class RayCaster:
             object_coordinates_mm=scene.object_coordinates_mm(len(instances)) if object_coordinates else None,
         )
 
+    def pose(self, posed: PosedModel) -> PosedSurface:
+        """A mesh in front of the camera; errors as in ``annotate``."""
+        return PosedSurface.of(self._surface(posed.key), posed.R_m2c, posed.t_m2c)
+
     def _cast(self, camera: Intrinsics, posed: PosedModel, limits: Window) -> _Hits:
-        body = PosedSurface.of(self._surface(posed.key), posed.R_m2c, posed.t_m2c)
+        body = self.pose(posed)
         window = limits.intersection(body.window(camera))
         faces = body.first_faces(Rays.through(camera, window))
         inside = image_window(camera).intersection(window)

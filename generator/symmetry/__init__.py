@@ -2,6 +2,6 @@
 
 from synthetless.symmetry.canonical import CanonicalMap, CanonicalPoses
 from synthetless.symmetry.groups import SymmetryGroup
-from synthetless.symmetry.table import SymmetryEntry, SymmetryTable
+from synthetless.symmetry.table import QuasiSymmetry, SymmetryEntry, SymmetryTable
 
-__all__ = ["CanonicalMap", "CanonicalPoses", "SymmetryEntry", "SymmetryGroup", "SymmetryTable"]
+__all__ = ["CanonicalMap", "CanonicalPoses", "QuasiSymmetry", "SymmetryEntry", "SymmetryGroup", "SymmetryTable"]

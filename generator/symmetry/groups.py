@@ -48,6 +48,8 @@ _log = logging.getLogger(__name__)
 Vector = tuple[float, float, float]
 
 _ORIGIN: Vector = (0.0, 0.0, 0.0)
+_SAMPLES = 7
+"""Of a continuous group, to find out whether another one contains it: sevenths of a turn are in none by chance."""
 _WITH_ONE_AXIS = ("SO(2)", "O(2)")
 _WITH_TWO_AXES = ("D", "T", "O", "I")
 
@@ -226,6 +228,23 @@ class SymmetryGroup:
         apart, together = np.linalg.norm(u - v, axis=1), np.linalg.norm(u + v, axis=1)
         angle = np.asarray(np.degrees(2 * np.arctan2(apart, together)))
         return np.minimum(angle, 180 - angle) if self.family == "O(2)" else angle
+
+    def contains(self, other: SymmetryGroup, apart_deg: float = 0.05, apart_mm: float = 0.01) -> bool:
+        """Whether every motion of another group is one of this group.
+
+        Args:
+            other: the group that may be smaller.
+            apart_deg: by how much a rotation of it may miss the nearest one of this group.
+            apart_mm: by how much its motions may move this group's fixed point.
+        """
+        if other.order > self.order:
+            return False
+        motions = other.motions(_SAMPLES)
+        identity = np.broadcast_to(np.eye(3), (len(motions), 3, 3))
+        c = np.array(self.offset_mm)
+        moved_mm = np.linalg.norm(motions[:, :3, :3] @ c + motions[:, :3, 3] - c, axis=1)
+        turned_deg = self.appearance_distance_deg(identity, motions[:, :3, :3])
+        return bool(turned_deg.max() <= apart_deg and moved_mm.max() <= apart_mm)
 
     @cached_property
     def _discrete_wxyz(self) -> Floats:

@@ -5,6 +5,9 @@ By hand (YAML or JSON):
     object 26: {group: C2, axis: [0, 0, 1], offset: [-7, 0, 0]}
     object 27: {group: C4}
     object 31: {group: D3, axis: [0, 0, 1], secondary_axis: [1, 0, 0]}
+    object 14: {group: C1, quasi: {group: SO(2), axis: [0, 0, 1], tolerance_mm: 2}}
+
+`quasi` is a larger group that the object has but for a detail no larger than `tolerance_mm`, which may be left out.
 
 As `symmetries.json` beside a dataset: {"scheme", "allocentric", "objects": {id: entry}}, and "decimals" if the poses
 that are labelled were rounded to less than 15 of them. An entry also says what follows from the group: order ("inf" for
@@ -16,9 +19,10 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
+import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
@@ -40,11 +44,31 @@ MODELS_INFO_FILE = "models_info.json"
 
 TABLE_KEYS = ("scheme", "allocentric", "decimals", "objects")
 
-_GIVEN_KEYS = ("group", "axis", "secondary_axis", "frame", "offset", "offset_mm", "reference_rotation")
+_GIVEN_KEYS = ("group", "axis", "secondary_axis", "frame", "offset", "offset_mm", "reference_rotation", "quasi")
+_QUASI_KEYS = ("group", "axis", "secondary_axis", "frame", "offset", "offset_mm", "tolerance_mm")
 _DERIVED_KEYS = ("order", "n_regressors", "anchors", "separation_deg")
 _BOP_SIZES = tuple(f"{what}_{axis}" for what in ("min", "max", "size") for axis in "xyz")
 _BOP_KEYS = ("symmetries_discrete", "symmetries_continuous", "diameter", *_BOP_SIZES)
+_SAME_POINT_MM = 0.01
+"""By how much fixed points written by hand may miss each other."""
 _OBJECT_KEY = re.compile(r"(?:object\s*|obj_?)?0*(\d+)", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class QuasiSymmetry:
+    """A group that an object has but for a detail, which an image may or may not show.
+
+    Attributes:
+        group: larger than the exact one.
+        tolerance_mm: the largest residual that was accepted when the group was chosen; None if it is not known.
+    """
+
+    group: SymmetryGroup
+    tolerance_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.tolerance_mm is not None and not 0 < self.tolerance_mm < math.inf:
+            raise UserError(f"tolerance_mm of quasi is {self.tolerance_mm}; a number of mm > 0 is needed")
 
 
 @dataclass(frozen=True)
@@ -54,10 +78,27 @@ class SymmetryEntry:
     Attributes:
         group: the symmetry group.
         reference_rotation: what the first regressor is centred on, three rows of three; None for the identity.
+        quasi: a larger group that the object nearly has, if one was chosen.
+
+    Raises:
+        UserError: the quasi-symmetry group is not larger, or does not contain the group.
     """
 
     group: SymmetryGroup
     reference_rotation: Matrix | None = None
+    quasi: QuasiSymmetry | None = None
+
+    def __post_init__(self) -> None:
+        if self.quasi is None:
+            return
+        larger, apart_mm = self.quasi.group, self.quasi.tolerance_mm or _SAME_POINT_MM
+        if not larger.contains(self.group, apart_mm=apart_mm):
+            raise UserError(
+                f"quasi is {_placed(larger)}, which does not contain the group {_placed(self.group)}: every symmetry "
+                "is a quasi-symmetry too, about the same axis and fixed point"
+            )
+        if self.group.contains(larger, apart_mm=apart_mm):
+            raise UserError(f"quasi is {larger.name}, the group itself: give a larger one, or leave quasi out")
 
     def canonical_map(self, scheme: Scheme, allocentric: bool = False, decimals: int = FULL_DECIMALS) -> CanonicalMap:
         """The map that labels this object's poses."""
@@ -208,16 +249,45 @@ class SymmetryTable:
             raise UserError(f"object {obj_id} is not in the symmetry table, which has {_listed(self.entries)}")
         return self.entries[obj_id].canonical_map(self.scheme, self.allocentric, self.decimals)
 
+    def quasi_map(self, obj_id: int) -> CanonicalMap:
+        """The map that labels an object's poses as if it had its quasi-symmetry group.
+
+        Raises:
+            UserError: the table does not have the object, or no such group of it.
+        """
+        own = self.canonical_map(obj_id)
+        quasi = self.entries[obj_id].quasi
+        if quasi is None:
+            raise UserError(f"object {obj_id} has no quasi-symmetry group in the symmetry table")
+        return replace(own, group=quasi.group)
+
     def _described(self, entry: SymmetryEntry) -> dict[str, Any]:
-        group = entry.group
-        described: dict[str, Any] = {"group": group.name}
-        described |= {"axis": None if group.axis is None else list(group.axis)}
-        if group.secondary_axis is not None:
-            described["secondary_axis"] = list(group.secondary_axis)
-        described["offset_mm"] = list(group.offset_mm)
+        described = _described_group(entry.group)
         if entry.reference_rotation is not None:
             described["reference_rotation"] = [list(row) for row in entry.reference_rotation]
+        if entry.quasi is not None:
+            described["quasi"] = _described_quasi(entry.quasi)
         return described | _derived(entry, self.scheme)
+
+
+def _described_group(group: SymmetryGroup) -> dict[str, Any]:
+    described: dict[str, Any] = {"group": group.name}
+    described |= {"axis": None if group.axis is None else list(group.axis)}
+    if group.secondary_axis is not None:
+        described["secondary_axis"] = list(group.secondary_axis)
+    described["offset_mm"] = list(group.offset_mm)
+    return described
+
+
+def _described_quasi(quasi: QuasiSymmetry) -> dict[str, Any]:
+    described = _described_group(quasi.group)
+    return described if quasi.tolerance_mm is None else described | {"tolerance_mm": quasi.tolerance_mm}
+
+
+def _placed(group: SymmetryGroup) -> str:
+    """A group's name and place, for messages."""
+    axis = "" if group.axis is None else f" about {list(group.axis)}"
+    return f"{group.name}{axis}" + (f" through {list(group.offset_mm)}" if any(group.offset_mm) else "")
 
 
 def _derived(entry: SymmetryEntry, scheme: Scheme) -> dict[str, Any]:
@@ -251,21 +321,43 @@ def _entry(value: object, scheme: Scheme, what: str) -> SymmetryEntry:
     if "group" not in value and not value.keys().isdisjoint(_BOP_KEYS):
         return SymmetryEntry(SymmetryGroup.from_bop(value, what))
     _refuse_unknown(value, _GIVEN_KEYS + _DERIVED_KEYS, "it", suggested=_BOP_KEYS)
+    quasi = None if value.get("quasi") is None else _quasi(value["quasi"])
+    entry = SymmetryEntry(_group(value), _reference(value.get("reference_rotation")), quasi)
+    _check_derived(value, entry, scheme)
+    return entry
+
+
+def _group(value: Mapping[Any, Any]) -> SymmetryGroup:
     if "group" not in value:
         raise UserError("it has no group; write for example {group: C2, axis: [0, 0, 1]}")
     if "offset" in value and "offset_mm" in value:
         raise UserError("offset and offset_mm are the same thing: give one of them")
     offset = value.get("offset_mm", value.get("offset"))
-    group = SymmetryGroup.from_name(
+    return SymmetryGroup.from_name(
         value["group"],
         axis=value.get("axis"),
         secondary_axis=value.get("secondary_axis"),
         offset_mm=(0, 0, 0) if offset is None else offset,
         frame=value.get("frame"),
     )
-    entry = SymmetryEntry(group, _reference(value.get("reference_rotation")))
-    _check_derived(value, entry, scheme)
-    return entry
+
+
+def _quasi(value: object) -> QuasiSymmetry:
+    if isinstance(value, str):
+        return QuasiSymmetry(SymmetryGroup.from_name(value))
+    if not isinstance(value, Mapping):
+        raise UserError(
+            f"quasi is {shown(value)}; write for example {{group: SO(2), axis: [0, 0, 1], tolerance_mm: 2}}"
+        )
+    _refuse_unknown(value, _QUASI_KEYS, "quasi")
+    try:
+        group = _group(value)
+    except UserError as error:
+        raise UserError(f"quasi: {error}") from error
+    tolerance = value.get("tolerance_mm")
+    if tolerance is not None and (isinstance(tolerance, bool) or not isinstance(tolerance, int | float)):
+        raise UserError(f"tolerance_mm of quasi is {shown(tolerance)}; a number of mm > 0 is needed")
+    return QuasiSymmetry(group, None if tolerance is None else float(tolerance))
 
 
 def _reference(value: object) -> Matrix | None:

@@ -112,6 +112,24 @@ def test_back_and_forth_gives_the_same_files(root: Path, tmp_path: Path) -> None
     assert contents(root) == before
 
 
+def test_a_quasi_symmetry_changes_no_label_and_can_be_taken_back(root: Path, tmp_path: Path) -> None:
+    before, symmetries = contents(root), tmp_path / "before.json"
+    shutil.copy(root / "symmetries.json", symmetries)
+    larger = json.loads(symmetries.read_text())
+    entry = larger["objects"]["25"]
+    entry["quasi"] = {"group": "C4", "axis": entry["axis"], "offset_mm": entry["offset_mm"], "tolerance_mm": 2}
+    (tmp_path / "larger.json").write_text(json.dumps(larger))
+    relabel(root, tmp_path / "larger.json", workers=1)
+    after = contents(root)
+    assert {name for name in before if before[name] != after[name]} == {"symmetries.json", "dataset.json"}
+    quasi = SymmetryTable.read(root).entries[25].quasi
+    assert quasi is not None and (quasi.group.name, quasi.tolerance_mm) == ("C4", 2)
+    relabel(root, workers=1)
+    assert contents(root) == after
+    relabel(root, symmetries, workers=1)
+    assert contents(root) == before
+
+
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.sampled_from(["C2", "C5", "SO(2)", "O(2)"]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,9 @@ import pytest
 from hypothesis import given, settings
 from symmetry_cases import ALL, SCHEMES, in_random_frame, random_rotations, seeds
 
-from synthetless.symmetry import SymmetryEntry, SymmetryGroup, SymmetryTable
+from synthetless.errors import UserError
+from synthetless.symmetry import QuasiSymmetry, SymmetryEntry, SymmetryGroup, SymmetryTable
+from synthetless.symmetry.detection.report import describe
 from synthetless.symmetry.quaternions import from_matrix, multiply, to_matrix
 
 BY_HAND = """
@@ -170,3 +173,75 @@ def test_files_and_objects_that_are_not_there(tmp_path: Path) -> None:
         SymmetryTable.read(tmp_path / "none.json")
     with pytest.raises(ValueError, match="object 5 is not in the symmetry table, which has objects 26"):
         SymmetryTable({26: SymmetryEntry(SymmetryGroup.trivial())}).canonical_map(5)
+
+
+QUASI = """
+1: {group: C1, quasi: {group: SO(2), axis: [0, 0, 1], offset: [-7, 0, 0], tolerance_mm: 2}}
+2: {group: C2, axis: [0, 0, 1], quasi: C4}
+3: {group: C2, axis: [1, 0, 0], quasi: {group: O(2), axis: [0, 0, 1]}}
+4: {group: SO(2), quasi: O(2)}
+5: {group: D2, quasi: O}
+6: {group: SO(2), axis: [0, 1, 0], quasi: SO(3)}
+7: {group: C3}
+"""
+
+
+def test_a_larger_group_that_an_object_nearly_has(tmp_path: Path) -> None:
+    table = read(tmp_path, QUASI)
+    quasi = table.entries[1].quasi
+    assert quasi == QuasiSymmetry(SymmetryGroup.from_name("SO(2)", offset_mm=(-7, 0, 0)), 2.0)
+    assert table.entries[7].quasi is None
+    table.write(tmp_path / "symmetries.json")
+    back = SymmetryTable.read(tmp_path / "symmetries.json")
+    assert back == table and back.digest() == table.digest()
+    assert "object 1: SO(2), axis z, fixed point (-7 0 0), but for a detail of at most 2 mm" in describe(table)
+    assert "quasi" not in describe(SymmetryTable({7: table.entries[7]}))
+
+
+def test_tables_without_quasi_symmetries_keep_their_bytes_and_digest() -> None:
+    entry = SymmetryEntry(SymmetryGroup.from_name("C2", offset_mm=(-7, 0, 0)))
+    table = SymmetryTable({26: entry})
+    assert "quasi" not in table.to_dict()["objects"]["26"]
+    assert table.digest() == "fbeedff75d4fb898d2d28b70f096f404bb7b3eb4944262ea635973bac1f0c856"
+    larger = replace(entry, quasi=QuasiSymmetry(SymmetryGroup.from_name("C4", offset_mm=(-7, 0, 0))))
+    assert SymmetryTable({26: larger}).digest() != table.digest()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1: {group: C3, quasi: C4}", "does not contain the group C3"),
+        ("1: {group: C2, axis: [1, 0, 0], quasi: C4}", "about the same axis"),
+        ("1: {group: C2, offset: [-7, 0, 0], quasi: C4}", "C2 about [0.0, 0.0, 1.0] through [-7.0, 0.0, 0.0]"),
+        ("1: {group: SO(2), quasi: C12}", "does not contain"),
+        ("1: {group: SO(2), quasi: {group: O(2), axis: [1, 0, 0]}}", "does not contain"),
+        ("1: {group: SO(3), quasi: O(2)}", "does not contain"),
+        ("1: {group: C4, quasi: C4}", "the group itself"),
+        ("1: {group: O(2), quasi: O(2)}", "the group itself"),
+        ("1: {group: C1, quasi: {axis: [0, 0, 1]}}", "quasi: it has no group"),
+        ("1: {group: C1, quasi: {group: C0}}", "quasi: "),
+        ("1: {group: C1, quasi: {group: C2, tolerance: 2}}", "did you mean 'tolerance_mm'"),
+        ("1: {group: C1, quasi: {group: C2, tolerance_mm: 0}}", "tolerance_mm of quasi is 0"),
+        ("1: {group: C1, quasi: {group: C2, tolerance_mm: true}}", "tolerance_mm of quasi is True"),
+        ("1: {group: C1, quasi: {group: C2, tolerance_mm: .nan}}", "tolerance_mm of quasi is nan"),
+        ("1: {group: C1, quasi: [C2]}", "quasi is ['C2']"),
+        ("1: {group: C1, quasi: {group: C2, quasi: C4}}", "quasi has the unknown key 'quasi'"),
+    ],
+)
+def test_quasi_symmetries_that_are_refused(text: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=re.escape(message)) as caught:
+        read(tmp_path, text)
+    assert "object 1: " in str(caught.value)
+
+
+def test_every_group_contains_exactly_its_subgroups() -> None:
+    named = {name: SymmetryGroup.from_name(name) for name in ("C1", "C2", "C3", "C4", "C6", "C7", "D2", "D3", "T", "O")}
+    named |= {name: SymmetryGroup.from_name(name) for name in ("SO(2)", "O(2)", "SO(3)")}
+    chains = {
+        "C4": {"C2"}, "C6": {"C2", "C3"}, "D2": {"C2"}, "D3": {"C3"}, "T": {"C2", "D2"},
+        "O": {"C2", "C4", "D2", "T"}, "SO(2)": {"C2", "C3", "C4", "C6", "C7"},
+        "O(2)": {"C2", "C3", "C4", "C6", "C7", "D2", "D3", "SO(2)"}, "SO(3)": set(named),
+    }  # fmt: skip
+    for large, group in named.items():
+        contained = {small for small, other in named.items() if group.contains(other)}
+        assert contained == {"C1", large} | chains.get(large, set()), large

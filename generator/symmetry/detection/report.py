@@ -158,7 +158,7 @@ def describe(table: SymmetryTable) -> str:
         "margin: by how many degrees any pose may turn before its label jumps; 0 if there are poses on a jump",
         f"dangerous under pitteri2019 (margin below {DANGEROUS_DEG:g} degrees):",
     ]
-    return "\n".join([aligned(rows, left=(1, 3, 4)), "", *notes, *_dangers(table)])
+    return "\n".join([aligned(rows, left=(1, 3, 4)), "", *notes, *_dangers(table), *_quasi_lines(table)])
 
 
 def dangerous_views(entry: SymmetryEntry) -> str:
@@ -199,6 +199,22 @@ def direction_text(direction: Floats) -> str:
 def _scheme_cells(entry: SymmetryEntry, scheme: Scheme) -> list[str]:
     margin = smallest_margin_deg(parse_name(entry.group.name), scheme)
     return [str(entry.canonical_map(scheme).n_regressors), "no jump" if margin >= 180 else f"{margin:.2f}"]
+
+
+def _quasi_lines(table: SymmetryTable) -> list[str]:
+    """One line for each object with a larger group that it nearly has; none if there are no such objects."""
+    lines = []
+    for obj_id, entry in table.entries.items():
+        if entry.quasi is not None:
+            name, axis, offset = group_cells(entry.quasi.group)
+            tolerance = entry.quasi.tolerance_mm
+            within = "" if tolerance is None else f", but for a detail of at most {tolerance:g} mm"
+            lines.append(f"  object {obj_id}: {name}, axis {axis}, fixed point {offset}{within}")
+    return (
+        ["quasi-symmetries (whether an image can tell them from symmetries: synthetless ambiguity):", *lines]
+        if lines
+        else []
+    )
 
 
 def _dangers(table: SymmetryTable) -> list[str]:
