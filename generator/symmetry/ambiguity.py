@@ -224,8 +224,8 @@ def _flat(depth_mm: Floats) -> Floats:
 def _bent(a: Floats, b: Floats, depth_a: Floats, depth_b: Floats) -> Mask:
     """Where both are hit, and none of the neighbours of one has a normal like that of the other."""
     both = np.isfinite(depth_a) & np.isfinite(depth_b)
-    unlike = _unlike(a, b) | _unlike(b, a)
-    return both & unlike
+    bent: Mask = both & (_unlike(a, b) | _unlike(b, a))
+    return bent
 
 
 def _unlike(a: Floats, b: Floats) -> Mask:
