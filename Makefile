@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries demo test interop lint format parts docs bench clean
+.PHONY: help setup system-libraries demo test interop learn lint format parts docs bench clean
 
 help:  ## this menu
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-18s %s\n", $$1, $$2}'
@@ -30,6 +30,10 @@ interop: setup  ## the exports in trainers' own loaders: Hugging Face datasets, 
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[interop]'
 	$(BIN)/pytest tests/exports tests/dataset/test_card.py
 
+learn: setup  ## torch and what else the learning system needs, and its tests
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[learn]'
+	$(BIN)/pytest tests/learning
+
 lint: setup  ## ruff and mypy --strict
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -42,8 +46,9 @@ format: setup  ## let ruff rewrite what it can
 parts: setup  ## model the built-in parts again (assets/parts)
 	$(BIN)/python -m synthetless.assets.parts.build
 
-docs: setup  ## write docs/recipe.md from the recipe's schema
+docs: setup  ## write docs/recipe.md and docs/learning_settings.md from the settings' schemas
 	$(BIN)/python -c "from synthetless.config import recipe_page; print(recipe_page(), end='')" > docs/recipe.md
+	$(BIN)/python -c "from synthetless.learning.settings import training_page; print(training_page(), end='')" > docs/learning_settings.md
 
 bench: setup  ## measure (see benchmarks/)
 	@set -e; for script in benchmarks/[a-z]*.py; do echo "== $$script"; $(BIN)/python -m benchmarks.$$(basename $$script .py); done

@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import Field, ValidationError
 
@@ -23,6 +23,7 @@ from synthetless.scenes.spec import Intrinsics
 
 BUILTIN = "builtin"
 BUILTIN_MODELS = Path(assets.__file__).parent / "parts"
+Tree = TypeVar("Tree", bound=Settings)
 SPLIT = "train_synthetless"
 """The folder of scenes, if a recipe names no other."""
 
@@ -108,12 +109,17 @@ class Setting:
 
 
 def load_recipe(path: Path | None, overrides: Sequence[str] = ()) -> Recipe:
-    """Read a recipe and apply ``key.path=value`` overrides (values are YAML).
+    """Read a recipe and apply ``key.path=value`` overrides (values are YAML); errors as in ``load_settings``."""
+    return load_settings(Recipe, path, overrides)
+
+
+def load_settings(kind: type[Tree], path: Path | None, overrides: Sequence[str] = ()) -> Tree:
+    """Read a tree of settings and apply ``key.path=value`` overrides (values are YAML).
 
     Raises:
         RecipeError: unreadable file, no mapping, unknown key, value of the wrong kind or outside its range.
     """
-    return parse_recipe({} if path is None else _read_recipe(path), overrides, "recipe" if path is None else str(path))
+    return _parse(kind, {} if path is None else _read_recipe(path), overrides, "recipe" if path is None else str(path))
 
 
 def parse_recipe(tree: dict[str, Any], overrides: Sequence[str] = (), origin: str = "recipe") -> Recipe:
@@ -122,12 +128,16 @@ def parse_recipe(tree: dict[str, Any], overrides: Sequence[str] = (), origin: st
     Raises:
         RecipeError: as in ``load_recipe``.
     """
+    return _parse(Recipe, tree, overrides, origin)
+
+
+def _parse(kind: type[Tree], tree: dict[str, Any], overrides: Sequence[str], origin: str) -> Tree:
     for override in overrides:
         _apply(tree, override)
     try:
-        return Recipe.model_validate(tree)
+        return kind.model_validate(tree)
     except ValidationError as error:
-        raise RecipeError(f"{origin}: {_explain(error)}") from None
+        raise RecipeError(f"{origin}: {_explain(error, kind)}") from None
 
 
 def dump_recipe(recipe: Recipe) -> dict[str, Any]:
@@ -185,12 +195,12 @@ def _apply(tree: dict[str, Any], override: str) -> None:
     node[path[-1]] = value
 
 
-def _explain(error: ValidationError) -> str:
+def _explain(error: ValidationError, kind: type[Settings]) -> str:
     """The first fault in one line: key, value, what would be right."""
     fault = error.errors(include_url=False)[0]
     key = ".".join(str(part) for part in fault["loc"])
     if fault["type"] == "extra_forbidden":
-        known = [setting.key for setting in settings()]
+        known = [setting.key for setting in settings(kind)]
         groups = sorted({".".join(k.split(".")[:-1]) for k in known} - {""})
         return f"unknown setting {shown(key)[1:-1]}{_nearest(key, known + groups)}"
     value = fault["input"]
@@ -235,17 +245,24 @@ def recipe_page() -> str:
         "between the two unless the setting says otherwise. `dataset.json` records the recipe as it was used.",
         "",
         "This page is written by `make docs`.",
+        *settings_tables(Recipe),
     ]
+    return "\n".join(lines) + "\n"
+
+
+def settings_tables(kind: type[Settings]) -> list[str]:
+    """Lines of Markdown: a table of each group's settings."""
+    lines: list[str] = []
     group = None
-    for setting in settings():
+    for setting in settings(kind):
         name = setting.key.rpartition(".")[0]
         if name != group:
             group = name
             title = f"`{group}`" if group else "At the top"
             lines += ["", f"## {title}", "", "| setting | value | default | meaning |", "|---|---|---|---|"]
-        kind = setting.kind.replace("|", "\\|")
-        lines.append(f"| `{setting.key}` | {kind} | `{json.dumps(setting.default)}` | {setting.description} |")
-    return "\n".join(lines) + "\n"
+        kind_of_value = setting.kind.replace("|", "\\|")
+        lines.append(f"| `{setting.key}` | {kind_of_value} | `{json.dumps(setting.default)}` | {setting.description} |")
+    return lines
 
 
 def models_folder(source: str) -> Path:

@@ -9,7 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = {"generator": "synthetless", "scenes": "synthetless.scenes", "assets": "synthetless.assets"}
+FOLDERS = {
+    "generator": "synthetless",
+    "scenes": "synthetless.scenes",
+    "assets": "synthetless.assets",
+    "learning": "synthetless.learning",
+}
 
 FLOORS = (
     {"errors", "assets"},
@@ -21,6 +26,7 @@ FLOORS = (
     {"dataset"},
     {"generation", "exports"},
     {"validation", "preview", "fetch", "doctor"},
+    {"learning"},
     {"cli"},
     {"__main__"},
 )
@@ -69,6 +75,8 @@ def test_imports_go_one_way() -> None:
                 wrong.append(f"{module} imports {name}: the package's name is synthetless")
             if name.split(".")[0] in {"bpy", "mathutils"} and here != "scenes":
                 wrong.append(f"{module} imports {name}: Blender is met in scenes alone")
+            if name.split(".")[0] == "torch" and here != "learning":
+                wrong.append(f"{module} imports {name}: torch is met in learning alone")
     assert not wrong, "\n".join(wrong)
 
 
@@ -80,6 +88,19 @@ def test_what_needs_no_blender_runs_where_it_is_not_installed() -> None:
         "import sys, importlib\n"
         "for name in ('bpy', 'mathutils', 'OpenEXR'): sys.modules[name] = None\n"
         f"for name in {names!r}: importlib.import_module(name)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_score_needs_no_torch() -> None:
+    """Nor does any other room load it."""
+    names = [module for module in MODULES if _room(module) != "learning" and _room(module) in WITHOUT_BLENDER]
+    names += [f"synthetless.learning.{name}" for name in ("score", "score_report", "results", "targets", "settings")]
+    code = (
+        "import sys, importlib\n"
+        f"for name in {names!r}: importlib.import_module(name)\n"
+        "assert 'torch' not in sys.modules\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

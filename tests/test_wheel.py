@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = {"generator": "", "scenes": "scenes/", "assets": "assets/", "configs": "configs/"}
+FOLDERS = {"generator": "", "scenes": "scenes/", "assets": "assets/", "configs": "configs/", "learning": "learning/"}
 
 
 def _build(what: str, project: Path, to: Path) -> Path:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from synthetless.cli import data, generate, inspect, labels
+from synthetless.cli import data, generate, inspect, labels, learning
 from synthetless.cli.terminal import end, printable
 
 
@@ -54,6 +54,10 @@ app.command("ambiguity")(labels.ambiguity_command)
 app.command("render")(generate.render_command)
 app.command("redo")(generate.redo_command)
 app.command("redevelop")(generate.redevelop_command)
+app.command("train")(learning.train_command)
+app.command("predict")(learning.predict_command)
+app.command("score")(learning.score_command)
+app.command("compare")(learning.compare_command)
 app.add_typer(export, name="export")
 export.command("coco")(data.coco_command)
 export.command("webdataset")(data.webdataset_command)

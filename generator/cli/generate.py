@@ -223,9 +223,11 @@ def redevelop_command(
     ] = None,
     workers: Workers = None,
 ) -> None:
-    """Make other pictures of the same scenes, as another camera sees them.
+    """Make other pictures of the same scenes.
 
-    Nothing is rendered, and no label changes. Example: synthetless redevelop out/a --to out/b --set sensor=primesense
+    Another camera takes them; nothing is rendered, and no label changes.
+
+    Example: synthetless redevelop out/a --to out/b --set sensor=primesense
     """
     from synthetless.generation.redevelop import redevelop
 

@@ -28,6 +28,7 @@ import trimesh
 import yaml
 
 from docs.figures.tless import overlay
+from tests.test_architecture import FLOORS
 
 if find_spec("bpy") is None:
     pytest.skip("the documentation's commands need Blender, extra 'blender'", allow_module_level=True)
@@ -44,9 +45,21 @@ SMALL_RECIPE: dict[str, Any] = {
 }
 """What the recipes of configs/ are changed to; their other settings stay."""
 
+SMALL_TRAINING: dict[str, Any] = {
+    "network": {"channels": 16, "hidden": 32, "weights": "none"},
+    "schedule": {"steps": 1, "images_per_step": 1},
+}
+"""What the trainings of configs/learning/ are changed to."""
+
 CHANGED = (
     (r"--images \d+(?!.*--dry-run)", "--images 2", "two images show what 30,000 would"),
     (r"symmetries detect T-LESS/models_cad", "symmetries detect {part}", "30 parts take minutes"),
+    (
+        r"^synthetless compare ",
+        "synthetless compare --steps 2 --seeds 1 --crops 20 ",
+        "1500 steps of 15 runs take long",
+    ),
+    (r"^synthetless (train|predict|compare) ", r"{torch} \1 ", "torch is not installed everywhere"),
     (r"^make ", "make -o setup ", "the environment is there already"),
     (r"fetch tless --to \S+$", r"\g<0> --from {tless}", "a test has no network"),
     (r"fetch dtd --to \S+$", r"\g<0> --from {dtd}", "a test has no network"),
@@ -128,6 +141,11 @@ class Reader:
         for path in (ROOT / "configs").glob("*.yaml"):
             recipe = merged(yaml.safe_load(path.read_text(encoding="utf-8")), SMALL_RECIPE)
             (folder / "configs" / path.name).write_text(yaml.safe_dump(recipe), encoding="utf-8")
+        (folder / "configs" / "learning").mkdir()
+        for path in (ROOT / "configs" / "learning").glob("*.yaml"):
+            content = yaml.safe_load(path.read_text(encoding="utf-8"))
+            small = merged(content, SMALL_RECIPE if "camera" in content else SMALL_TRAINING)
+            (folder / "configs" / "learning" / path.name).write_text(yaml.safe_dump(small), encoding="utf-8")
         (folder / ".venv").symlink_to(sys.prefix)
         (folder / "Makefile").symlink_to(ROOT / "Makefile")
 
@@ -236,6 +254,13 @@ def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="session")
+def program_with_torch() -> Path:
+    """The command, where it can train."""
+    pytest.importorskip("torch", reason="torch is not installed; extra 'learn' has it")
+    return Path(sys.executable).parent / "synthetless"
+
+
 @pytest.fixture
 def made_before(request: pytest.FixtureRequest) -> dict[str, Callable[[Path], object]]:
     """What pages take for granted where they name it, and how it comes into a reader's folder."""
@@ -257,6 +282,12 @@ def made_before(request: pytest.FixtureRequest) -> dict[str, Callable[[Path], ob
     def table(place: Path) -> None:
         place.write_text("object 5: {group: C2}\n", encoding="utf-8")
 
+    def almost(place: Path) -> None:
+        place.write_text("object 5: {group: C2, quasi: C4}\n", encoding="utf-8")
+
+    def results(place: Path) -> None:
+        place.write_text("scene_id,im_id,obj_id,score,R,t,time\n", encoding="utf-8")
+
     return {
         "T-LESS/models_cad": link_to("models"),
         "DTD/images": link_to("dtd"),
@@ -267,6 +298,8 @@ def made_before(request: pytest.FixtureRequest) -> dict[str, Callable[[Path], ob
         "BOP/tless": bop_dataset,
         "DIR": copy_of("demo"),  # docs/symmetry.md
         "my.yaml": table,  # docs/symmetry.md
+        "almost.yaml": almost,  # docs/symmetry.md
+        "results.csv": results,  # docs/learning.md, without torch
     }
 
 
@@ -281,7 +314,7 @@ def test_a_page_can_be_followed(
 ) -> None:
     page = blocks(PAGES[name].read_text(encoding="utf-8"))
     monkeypatch.chdir(tmp_path)
-    sources = {"tless": "tless_models", "dtd": "dtd", "part": "part"}
+    sources = {"tless": "tless_models", "dtd": "dtd", "part": "part", "torch": "program_with_torch"}
     reader = Reader(tmp_path, {key: partial(request.getfixturevalue, value) for key, value in sources.items()})
     said = "\n".join(block.text for block in page)
     has_tless = request.getfixturevalue("models") != request.getfixturevalue("builtin_models")
@@ -412,3 +445,10 @@ def test_what_a_step_of_a_walk_calls_is_in_its_file() -> None:
         source = (ROOT / file).read_text(encoding="utf-8")
         for name in re.findall(r"`(?:\w+\.)*(\w+)(?:\(\))?`", step):
             assert re.search(rf"\b{name}\b", source), f"{file}: {name}"
+
+
+def test_the_architecture_s_floors_are_those_that_imports_are_held_to() -> None:
+    text = PAGES["docs/architecture.md"].read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\d+) \| (`.+?`) \|", text, re.MULTILINE)
+    told = {name: int(floor) for floor, names in rows for name in re.findall(r"`(\w+)/?`", names)}
+    assert told == {room: number for number, rooms in enumerate(FLOORS, start=1) for room in rooms}

@@ -57,9 +57,10 @@ def test_the_examples_run_and_print_what_the_page_says() -> None:
 
 
 def test_the_table_by_hand_is_one() -> None:
-    (text,) = _blocks("yaml")
-    entries = SymmetryTable.from_dict(yaml.safe_load(text)).entries
-    assert {obj_id: entry.group.name for obj_id, entry in entries.items()} == {26: "C2", 27: "C4", 31: "D2"}
+    exact, almost = (SymmetryTable.from_dict(yaml.safe_load(text)).entries for text in _blocks("yaml"))
+    assert {obj_id: entry.group.name for obj_id, entry in exact.items()} == {26: "C2", 27: "C4", 31: "D2"}
+    quasi = almost[14].quasi
+    assert quasi is not None and (quasi.group.name, quasi.tolerance_mm) == ("SO(2)", 2.0)
 
 
 @pytest.mark.parametrize("obj_id", [26, 27])

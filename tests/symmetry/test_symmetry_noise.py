@@ -81,9 +81,12 @@ def test_noise_never_makes_another_group(name: str, seed: int) -> None:
             assert "symmetries_discrete" in str(error)
     assert {snapped.name for snapped, _ in found} == {name}
     assert len(found) > 40
+    # Noise e tilts the axis of a turn of 360 / n degrees by up to e / (2 sin(180 / n)), and a half turn about it by
+    # twice that. A list may be one such turn alone; 12 is the largest n here.
+    furthest_deg = 0.5 / np.sin(np.pi / 12)
     for snapped, group in found:
         apart = angle_deg(snapped.elements_wxyz[:, None], group.elements_wxyz[None]).min(axis=1).max()
-        assert apart < 1.5
+        assert apart < furthest_deg + 1e-3
 
 
 @pytest.mark.parametrize("n", [4, 5])

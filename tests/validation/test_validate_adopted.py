@@ -349,6 +349,19 @@ def test_several_sensors_in_a_scene_are_named_as_unsupported(adopted: Path, besi
     assert any("several sensors in one scene folder (scene_gt_cam1.json) are not supp" in note for note in report.notes)
 
 
+def test_symmetries_that_adopt_was_told_otherwise_are_no_fault(adopted: Path, tmp_path: Path) -> None:
+    """models_info.json declares what is no group, and a table said it instead."""
+    with Victim(adopted).json(adopted / "models/models_info.json") as infos:
+        infos["3"]["symmetries_discrete"][0][0] = 0.5
+    table = tmp_path / "table.json"
+    table.write_text('{"3": "C1"}')
+    with pytest.raises(ValueError, match=r"models_info\.json: object 3"):
+        adopt(adopted, workers=1)
+    adopt(adopted, symmetries=table, workers=1)
+    report = validate(adopted, workers=1)
+    assert report.valid, report.lines()
+
+
 # --- what adopt refuses, and validate tells while it goes on ---
 
 

@@ -1,0 +1,226 @@
+"""Prediction: detections, the regressor that the classifier chooses, corners to pose by PnP, a BOP result file."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from synthetless.dataset.reader import Dataset, Image, Instance
+from synthetless.errors import UserError
+from synthetless.io.files import atomic_write, read_bytes, read_json
+from synthetless.io.images import decode_rgb, encode_png
+from synthetless.learning.data import picture, sample_of
+from synthetless.learning.detector import Detections, Detector
+from synthetless.learning.fit import CHECKPOINT_FILE, load, load_weights
+from synthetless.learning.operators import iou
+from synthetless.learning.results import Estimate, write_results
+from synthetless.learning.solve import solve_pose
+from synthetless.learning.train import Parts, choose_device, read_run
+
+Floats = NDArray[np.float64]
+
+_TRUE, _PREDICTED = (60, 200, 60), (230, 60, 40)
+_EDGES = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
+_SHOWN = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A picture to predict from, and the true poses, if they are known.
+
+    Attributes:
+        scene_id, im_id, key: which it is.
+        K: (3, 3) camera matrix.
+        read: its pixels (H, W, 3).
+        instances: what is in it.
+    """
+
+    scene_id: int
+    im_id: int
+    key: str
+    K: Floats
+    read: Callable[[], NDArray[np.uint8]]
+    instances: Sequence[Instance] = ()
+
+    @classmethod
+    def of(cls, image: Image) -> Picture:
+        """An image of a dataset."""
+        return cls(image.scene_id, image.im_id, image.key, image.K, image.rgb, image.instances)
+
+
+def pictures_of(source: Path, split: str | None = None, camera: Path | None = None) -> list[Picture]:
+    """The images of a BOP dataset, or of a folder of pictures, which are scene 0 and numbered by their names' order.
+
+    Args:
+        source: the folder.
+        split: of the dataset.
+        camera: BOP's camera.json (fx, fy, cx, cy), for a folder of pictures.
+
+    Raises:
+        UserError: it is neither; or a camera is missing or damaged.
+    """
+    if camera is None:
+        return [Picture.of(image) for image in Dataset.open(source, split)]
+    intrinsics = read_json(camera)
+    try:
+        fx, fy, cx, cy = (float(intrinsics[name]) for name in ("fx", "fy", "cx", "cy"))
+    except (KeyError, TypeError, ValueError):
+        raise UserError(f"{camera}: must have the numbers fx, fy, cx and cy, as BOP's camera.json") from None
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    paths = sorted(path for path in source.glob("*") if path.suffix.lower() in (".png", ".jpg", ".jpeg"))
+    if not paths:
+        raise UserError(f"{source}: holds no pictures (*.png, *.jpg)")
+    return [Picture(0, number, path.stem, K, partial(_read_picture, path)) for number, path in enumerate(paths)]
+
+
+def _read_picture(path: Path) -> NDArray[np.uint8]:
+    return decode_rgb(read_bytes(path), path)
+
+
+class Predictor:
+    """A trained detector, ready for pictures."""
+
+    def __init__(self, run: Path, device: str = "auto") -> None:
+        """Load a run.
+
+        Raises:
+            UserError: it is no run, has no checkpoint yet, or is damaged.
+        """
+        self._training, self.parts = read_run(run)
+        # The run's own weights follow; those that the backbone began with need not be there any more.
+        network = self._training.network.model_copy(update={"weights": "none"})
+        detector = self.parts.detector(self._training.model_copy(update={"network": network}))
+        path = run / CHECKPOINT_FILE
+        load_weights(detector, load(path).get("model", {}), path)
+        self._device = choose_device(device)
+        self._detector: Detector = detector.to(self._device).eval()
+
+    def detect(self, pixels: NDArray[np.uint8]) -> Detections:
+        """What is in a picture (H, W, 3)."""
+        found = self._detector.detect(picture(pixels, None, 0, 0)[None].to(self._device))[0]
+        parts = (found.boxes, found.classes, found.scores, found.corners_px, found.index)
+        return Detections(*(part.cpu() for part in parts))
+
+    def estimates(self, image: Picture, found: Detections, seconds: float) -> list[Estimate]:
+        """Poses of the detections of an image; corners that have none are left out."""
+        estimates = []
+        for number in range(len(found.scores)):
+            obj_id = self.parts.ids[int(found.classes[number]) - 1]
+            corners = found.corners_px[number].numpy().astype(np.float64)
+            pose = solve_pose(corners, self.parts.boxes_mm[obj_id], image.K)
+            if pose is not None:
+                score = float(found.scores[number])
+                estimates.append(Estimate(image.scene_id, image.im_id, obj_id, score, pose.R_m2c, pose.t_m2c, seconds))
+        return estimates
+
+
+def predict(
+    run: Path,
+    source: Path,
+    to: Path,
+    overlays: Path | None = None,
+    split: str | None = None,
+    device: str = "auto",
+    camera: Path | None = None,
+) -> int:
+    """Predict the poses in all images of a dataset or folder.
+
+    Args:
+        run: folder of a training.
+        source: BOP dataset folder, of one's own, adopted or any other, of which only pictures and cameras are used;
+            with ``camera`` a folder of pictures.
+        to: result file to write.
+        overlays: folder for a picture of each image with true (green) and predicted (red) boxes.
+        split: of the dataset.
+        device: as for training.
+        camera: see ``pictures_of``.
+
+    Returns:
+        How many poses were found.
+    """
+    predictor = Predictor(run, device)
+    estimates: list[Estimate] = []
+    for image in pictures_of(source, split, camera):
+        pixels, started = image.read(), time.perf_counter()
+        found = predictor.detect(pixels)
+        own = predictor.estimates(image, found, 0.0)
+        seconds = time.perf_counter() - started
+        own = [Estimate(e.scene_id, e.im_id, e.obj_id, e.score, e.R_m2c, e.t_m2c, seconds) for e in own]
+        estimates += own
+        if overlays is not None:
+            atomic_write(overlays / f"{image.key}.png", encode_png(draw(pixels, image, own, predictor.parts)))
+    write_results(to, estimates)
+    return len(estimates)
+
+
+def draw(pixels: NDArray[np.uint8], image: Picture, estimates: Sequence[Estimate], parts: Parts) -> NDArray[np.uint8]:
+    """The picture with the boxes of true poses (green) and of the surer estimates (red), as the paper's figures."""
+    canvas = pixels.copy()
+    for instance in image.instances:
+        if instance.obj_id in parts.boxes_mm:
+            _draw_box(canvas, parts.boxes_mm[instance.obj_id], instance.R_m2c, instance.t_m2c, image.K, _TRUE)
+    for estimate in estimates:
+        if estimate.score >= _SHOWN:
+            _draw_box(canvas, parts.boxes_mm[estimate.obj_id], estimate.R_m2c, estimate.t_m2c, image.K, _PREDICTED)
+    return canvas
+
+
+def _draw_box(
+    canvas: NDArray[np.uint8], box_mm: Floats, R: Floats, t: Floats, K: Floats, color: tuple[int, int, int]
+) -> None:
+    seen = (box_mm @ R.T + t) @ K.T
+    if (seen[:, 2] <= 0).any():
+        return
+    at = np.clip(seen[:, :2] / seen[:, 2:], -1e4, 1e4).round().astype(int)
+    for a, b in _EDGES:
+        cv2.line(canvas, at[a].tolist(), at[b].tolist(), color, 1, cv2.LINE_AA)
+
+
+def detections_of(predictor: Predictor, images: Sequence[Image]) -> Iterator[tuple[Image, Detections]]:
+    """What is found in each image."""
+    for image in images:
+        yield image, predictor.detect(image.rgb())
+
+
+def mean_average_precision(predictor: Predictor, images: Sequence[Image], iou_threshold: float = 0.5) -> float:
+    """mAP of the boxes at one overlap, over the objects; instances less than a tenth visible do not count."""
+    ids = predictor.parts.ids
+    scored: dict[int, list[tuple[float, bool]]] = {obj_id: [] for obj_id in ids}
+    asked = dict.fromkeys(ids, 0)
+    for image, found in detections_of(predictor, images):
+        sample = sample_of(image)
+        for number, obj_id in enumerate(ids, start=1):
+            mine = sample.obj_ids == obj_id
+            boxes, counted = sample.boxes[mine], sample.visib_fract[mine] >= 0.1
+            asked[obj_id] += int(counted.sum())
+            taken = np.zeros(len(boxes), dtype=bool)
+            rows = torch.nonzero(found.classes == number)[:, 0]
+            overlaps = iou(found.boxes[rows], torch.from_numpy(boxes).float()).numpy()
+            for row, overlap in zip(rows, overlaps, strict=True):
+                free = np.where(taken, 0, overlap)
+                best = int(free.argmax()) if len(free) else -1
+                hit = best >= 0 and free[best] >= iou_threshold
+                if hit:
+                    taken[best] = True
+                if not hit or counted[best]:
+                    scored[obj_id].append((float(found.scores[row]), bool(hit)))
+    return float(np.mean([_average_precision(scored[i], asked[i]) for i in ids if asked[i]] or [0.0]))
+
+
+def _average_precision(scored: Sequence[tuple[float, bool]], asked: int) -> float:
+    """Area below the precision-recall curve, precision made monotonous, at every recall that occurs."""
+    if not scored:
+        return 0.0
+    hits = np.array([hit for _, hit in sorted(scored, key=lambda pair: -pair[0])])
+    recall = np.cumsum(hits) / asked
+    precision = np.cumsum(hits) / np.arange(1, len(hits) + 1)
+    best = np.maximum.accumulate(precision[::-1])[::-1]
+    return float(np.sum(np.diff(recall, prepend=0.0) * best))
