@@ -96,6 +96,10 @@ def detect_command(
         list[str] | None,
         typer.Option(metavar="ID=VALUE|FILE", help="Of one object: 26=0.5mm or 26=2%; or a table of them. Repeatable."),
     ] = None,
+    quasi: Annotated[
+        str | None,
+        typer.Option(metavar="VALUE", help="Also find larger groups within 2mm or 3%, for ambiguity."),
+    ] = None,
     scale: Annotated[
         float, typer.Option(min=0, metavar="FACTOR", help="Millimetres per unit of the files; 1000 for metres.")
     ] = 1.0,
@@ -107,9 +111,10 @@ def detect_command(
 
     The report also tells what every other group would leave as residual.
     """
-    from synthetless.symmetry.detection import detect_folder, parse_tolerances, report
+    from synthetless.symmetry.detection import Tolerance, detect_folder, parse_tolerances, report
 
-    detected = detect_folder(models, tolerance_percent, scale, workers, parse_tolerances(tolerance or ()))
+    larger = None if quasi is None else Tolerance.parse(quasi)
+    detected = detect_folder(models, tolerance_percent, scale, workers, parse_tolerances(tolerance or ()), larger)
     if out is not None:
         detected.table().write(out)
     if models_out is not None:

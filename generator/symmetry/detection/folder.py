@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -17,10 +18,11 @@ from synthetless.io.meshes import read_mesh
 from synthetless.io.models import find_meshes
 from synthetless.io.parallel import each
 from synthetless.symmetry.atlas import SCHEMES, Scheme
-from synthetless.symmetry.detection.detect import Detected, detect
+from synthetless.symmetry.detection.detect import Detected, detect, measure
+from synthetless.symmetry.detection.quasi import quasi_fit
 from synthetless.symmetry.detection.residual import GroupFit
 from synthetless.symmetry.groups import SymmetryGroup
-from synthetless.symmetry.table import MODELS_INFO_FILE, SymmetryEntry, SymmetryTable, object_id
+from synthetless.symmetry.table import MODELS_INFO_FILE, QuasiSymmetry, SymmetryEntry, SymmetryTable, object_id
 
 _TOLERANCE = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(mm|%)\s*")
 _SMALL_FOLDER_MM = 20.0  # of a folder whose largest part is smaller than this the units are asked about
@@ -94,12 +96,22 @@ class DetectedObject:
         path: its mesh.
         info: BOP's diameter, min_ and size_, mm.
         detected: its groups and their residuals.
+        quasi: the larger group within the tolerance for those, if one was asked for and there is one.
+        quasi_tolerance_mm: that tolerance; None if none was asked for.
     """
 
     obj_id: int
     path: Path
     info: Mapping[str, float]
     detected: Detected
+    quasi: GroupFit | None = None
+    quasi_tolerance_mm: float | None = None
+
+    @property
+    def entry(self) -> SymmetryEntry:
+        """The object in a symmetry table."""
+        quasi = None if self.quasi is None else QuasiSymmetry(self.quasi.group, self.quasi_tolerance_mm)
+        return SymmetryEntry(self.detected.answer.group, None, quasi)
 
     @property
     def warning(self) -> str | None:
@@ -147,7 +159,7 @@ class DetectedFolder:
 
     def table(self, scheme: Scheme = SCHEMES[0]) -> SymmetryTable:
         """The detected groups as a symmetry table."""
-        return SymmetryTable({o.obj_id: SymmetryEntry(o.detected.answer.group) for o in self.objects}, scheme)
+        return SymmetryTable({o.obj_id: o.entry for o in self.objects}, scheme)
 
     def to_json(self) -> dict[str, Any]:
         """Everything, as plain dicts, lists and numbers."""
@@ -188,6 +200,7 @@ def detect_folder(
     scale: float = 1.0,
     workers: int | None = None,
     tolerances: Mapping[int, Tolerance] | None = None,
+    quasi: Tolerance | None = None,
 ) -> DetectedFolder:
     """Detect the symmetry group of every mesh in a folder.
 
@@ -200,6 +213,7 @@ def detect_folder(
         workers: processes; one per available core if None. They are spawned: a script that calls this needs
             ``if __name__ == "__main__"``.
         tolerances: of objects that have another one.
+        quasi: what the largest residual of a larger group may be that an object has but for a detail; None for none.
 
     Raises:
         UserError: wrong numbers, a tolerance of an object that is not there, a folder without meshes, a mesh that is
@@ -214,7 +228,7 @@ def detect_folder(
         known = ", ".join(map(str, files.paths))
         raise UserError(f"object {strangers[0]} has a tolerance, but {folder} holds objects {known}")
     tasks = [
-        _Task(obj_id, path, others.get(obj_id, Tolerance(tolerance_percent)), scale, declared.get(obj_id))
+        _Task(obj_id, path, others.get(obj_id, Tolerance(tolerance_percent)), scale, declared.get(obj_id), quasi)
         for obj_id, path in files.paths.items()
     ]
     tasks.sort(key=lambda task: -task.path.stat().st_size)  # the longest first, so that no core ends up alone
@@ -229,6 +243,7 @@ class _Task:
     tolerance: Tolerance
     scale: float
     declared: SymmetryGroup | None
+    quasi: Tolerance | None
 
 
 def _detect_file(task: _Task) -> DetectedObject:
@@ -240,7 +255,11 @@ def _detect_file(task: _Task) -> DetectedObject:
         detected = detect(mesh.vertices_mm, mesh.faces, mesh.diameter_mm, percent, task.declared)
     except ValueError as error:
         raise UserError(f"{task.path}: {error}") from error
-    return DetectedObject(task.obj_id, task.path, mesh.bop_info(), detected)
+    if task.quasi is None:
+        return DetectedObject(task.obj_id, task.path, mesh.bop_info(), detected)
+    most_mm = task.quasi.percent_of(mesh.diameter_mm) / 100 * mesh.diameter_mm
+    larger = quasi_fit(detected, most_mm, partial(measure, mesh.vertices_mm, mesh.faces, mesh.diameter_mm))
+    return DetectedObject(task.obj_id, task.path, mesh.bop_info(), detected, larger, most_mm)
 
 
 def _declared(folder: Path) -> dict[int, SymmetryGroup]:
@@ -267,6 +286,7 @@ def _object_json(o: DetectedObject) -> dict[str, Any]:
         "warning": o.warning,
         "is_complete": found.is_complete,
         "residuals": [_fit_json(f, found) for f in found.fits],
+        **({} if o.quasi is None else {"quasi": _group_json(o.quasi.group) | {"max_mm": o.quasi.residual.max_mm}}),
     }
 
 

@@ -40,7 +40,7 @@ _RESIDUAL_HEAD = ["max mm", "%", "p95 mm", "%", "rms mm", "%"]
 def report(detected: DetectedFolder) -> str:
     """Every object's residual table, then one line for each, then what to look at twice."""
     blocks = [residual_table(o) for o in detected.objects]
-    return "\n\n".join([*blocks, summary(detected), *_remarks(detected)])
+    return "\n\n".join([*blocks, summary(detected), *_quasi_summary(detected), *_remarks(detected)])
 
 
 def residual_table(o: DetectedObject) -> str:
@@ -75,6 +75,19 @@ def summary(detected: DetectedFolder) -> str:
         *(f"object {obj_id}: within {tolerance}" for obj_id, tolerance in sorted(detected.tolerances.items())),
     ]
     return "\n".join([text, "", *legend])
+
+
+def _quasi_summary(detected: DetectedFolder) -> list[str]:
+    """One line for each object, if larger groups were asked for that they have but for a detail."""
+    lines = []
+    for o in detected.objects:
+        if o.quasi is not None:
+            name, axis, offset = group_cells(o.quasi.group)
+            place = f"axis {axis}, fixed point {offset}"
+            lines.append(f"  object {o.obj_id}: {name}, {place}, but for {o.quasi.residual.max_mm:.3f} mm")
+        elif o.quasi_tolerance_mm is not None:
+            lines.append(f"  object {o.obj_id}: no larger group within {o.quasi_tolerance_mm:.3f} mm")
+    return ["\n".join(["quasi-symmetries:", *lines])] if lines else []
 
 
 def group_cells(group: SymmetryGroup) -> list[str]:
