@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from docs.figures import notch
 from synthetless.annotation.instances import PosedModel
 from synthetless.annotation.scene import scene_caster
 from synthetless.io.models import ObjectModel, load_models
@@ -236,6 +237,7 @@ FIGURES: dict[str, Callable[[], bytes]] = {
     "symmetry_jump.svg": jump_figure,
     "symmetry_charts.png": charts_figure,
     "symmetry_part.png": part_figure,
+    "symmetry_notch.png": lambda: _png(notch.draw(), 120),
 }
 
 
