@@ -19,7 +19,7 @@ from synthetless.io.color import mean_luminance
 from synthetless.io.files import read_bytes
 from synthetless.preview.distributions import Distribution, Observations, distributions, labelled_classes
 from synthetless.scenes.spec import SceneSpec
-from synthetless.symmetry import SymmetryTable
+from synthetless.symmetry import SymmetryEntry, SymmetryTable
 from synthetless.symmetry.atlas import SCHEMES, Scheme
 
 Floats = NDArray[np.float64]
@@ -48,6 +48,23 @@ class NearJump:
 
 
 @dataclass(frozen=True)
+class DetailStatistics:
+    """How often the images show that an object is not as symmetrical as its quasi-symmetry group.
+
+    Attributes:
+        quasi: name of that group.
+        visible: share of the instances whose image leaves no coset open but the true one.
+        mean_view_ambiguity: mean share of the cosets that are left open.
+        views_visible: the former instances by cell of the viewing sphere, as ``ClassStatistics.views`` has all.
+    """
+
+    quasi: str
+    visible: float
+    mean_view_ambiguity: float
+    views_visible: tuple[tuple[int, ...], ...]
+
+
+@dataclass(frozen=True)
 class ClassStatistics:
     """One object's labels.
 
@@ -63,6 +80,7 @@ class ClassStatistics:
             true and by their canonical pose.
         coverage, coverage_canonical: share of the cells that are seen at all.
         coverage_uniform: the share that as many views, uniform on the sphere, are expected to see.
+        detail: what ``synthetless ambiguity`` found; None without a quasi-symmetry group, or where it was not called.
     """
 
     obj_id: int
@@ -77,6 +95,7 @@ class ClassStatistics:
     coverage: float
     coverage_canonical: float
     coverage_uniform: float
+    detail: DetailStatistics | None
 
 
 @dataclass(frozen=True)
@@ -139,7 +158,10 @@ def statistics(dataset: Path, split: str | None = None, luminance_images: int = 
 
 @dataclass(frozen=True, eq=False)
 class _Instances:
-    """Columns of N labelled instances: true and canonical poses, visible fraction, regressor."""
+    """Columns of N labelled instances: true and canonical poses, visible fraction, regressor, ambiguity.
+
+    ``view_ambiguity`` is nan and ``is_certain`` false where the ambiguity of an instance is not known.
+    """
 
     obj_id: Integers
     visib_fract: Floats
@@ -148,6 +170,8 @@ class _Instances:
     t_m2c: Floats
     R_canonical: Floats
     t_canonical: Floats
+    view_ambiguity: Floats
+    is_certain: NDArray[np.bool_]
 
     @classmethod
     def in_scene(cls, scene: Scene) -> _Instances:
@@ -160,6 +184,8 @@ class _Instances:
             poses.t_m2c,
             labels.R_m2c,
             labels.t_m2c,
+            np.array([np.nan if entry is None else entry["view_ambiguity"] for entry in scene.ambiguity]),
+            np.array([entry is not None and len(entry["cosets_alike"]) == 1 for entry in scene.ambiguity], dtype=bool),
         )
 
     @classmethod
@@ -232,6 +258,20 @@ def _class(obj_id: int, of: _Instances, table: SymmetryTable) -> ClassStatistics
         coverage=coverage(views),
         coverage_canonical=coverage(canonical),
         coverage_uniform=uniform_coverage(len(of.obj_id)),
+        detail=_detail(of, table.entries[obj_id]),
+    )
+
+
+def _detail(of: _Instances, entry: SymmetryEntry) -> DetailStatistics | None:
+    if entry.quasi is None or np.isnan(of.view_ambiguity).any():
+        return None
+    certain = of.is_certain
+    seen_from = viewing_directions(of.R_m2c[certain], of.t_m2c[certain])
+    return DetailStatistics(
+        quasi=entry.quasi.group.name,
+        visible=float(certain.mean()),
+        mean_view_ambiguity=float(of.view_ambiguity.mean()),
+        views_visible=_rows(cell_counts(seen_from)),
     )
 
 

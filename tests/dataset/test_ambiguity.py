@@ -24,6 +24,7 @@ from synthetless.dataset.relabel import adopt, relabel
 from synthetless.errors import UserError
 from synthetless.exports.coco import export_coco
 from synthetless.exports.webdataset import export_webdataset, relabel_webdataset
+from synthetless.preview.statistics import statistics
 from synthetless.validation import validate
 
 TABLE = """
@@ -245,6 +246,19 @@ def test_exports(root: Path, tmp_path: Path, small_scene_folders: None) -> None:
     export_webdataset(root, tmp_path / "anew", workers=1)
     assert contents(tmp_path / "shards") == contents(tmp_path / "anew")
     assert not (tmp_path / "anew" / "ambiguity.json").exists()
+
+
+def test_statistics_count_the_views_that_show_the_detail(judged: Path, tmp_path: Path) -> None:
+    of = statistics(judged)
+    angle, cylinder, box = of.classes
+    assert cylinder.detail is None
+    assert angle.detail is not None and box.detail is not None
+    assert (box.detail.quasi, box.detail.visible, box.detail.mean_view_ambiguity) == ("D2", 0.0, 1.0)
+    found = [entry for entry in entries(judged) if entry["obj_id"] == 1]
+    assert angle.detail.visible == np.mean([len(entry["cosets_alike"]) == 1 for entry in found])
+    assert np.sum(angle.detail.views_visible) == round(angle.detail.visible * angle.instances)
+    assert (np.array(angle.detail.views_visible) <= np.array(angle.views)).all()
+    json.dumps(of.to_json())
 
 
 def test_the_command(root: Path) -> None:
