@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from synthetless.config import models_folder
 from synthetless.dataset.ambiguity import AmbiguitySource, see_images
-from synthetless.dataset.layout import AMBIGUITY_FILE, find_models_folder
-from synthetless.dataset.reader import Scene
+from synthetless.dataset.layout import AMBIGUITY_FILE, DATASET_FILE, find_models_folder
+from synthetless.dataset.reader import Scene, read_recipe
 from synthetless.dataset.records import AmbiguityEntry
 from synthetless.errors import UserError
 from synthetless.io.files import read_json
@@ -59,12 +60,15 @@ def check_ambiguity(root: Path, scene: SceneRecords) -> Iterator[Finding]:
 
 
 def _has_models(root: Path) -> bool:
-    """Models of an adopted dataset may be elsewhere: what is not there cannot be cast at."""
+    """Models of an adopted dataset, and distractors, may be elsewhere: what is not there cannot be cast at."""
     try:
         find_models_folder(root)
+        recipe = read_recipe(root) if (root / DATASET_FILE).exists() else None
     except UserError:
         return False
-    return True
+    if recipe is None or recipe.source.distractors is None or recipe.objects.distractors[1] == 0:
+        return True
+    return models_folder(recipe.source.distractors).is_dir()
 
 
 @lru_cache(maxsize=1)

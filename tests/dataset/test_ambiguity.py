@@ -205,7 +205,7 @@ def _objects(scene: Scene, number: int) -> list[int]:
     return [int(obj_id) for obj_id in scene.poses.obj_ids[first:end]]
 
 
-def test_distractors_hide(tmp_path: Path, parts: Path) -> None:
+def test_distractors_hide(tmp_path: Path, parts: Path, small_scene_folders: None) -> None:
     """Moved to right before the camera, a ball leaves nothing to see."""
     root, balls = tmp_path / "d", valid_dataset.write_distractors(tmp_path / "balls")
     overrides = ("objects.distractors=[2, 3]", f"source.distractors={balls}")
@@ -214,6 +214,10 @@ def test_distractors_hide(tmp_path: Path, parts: Path) -> None:
     relabel(root, tmp_path / "table.yaml", workers=1)
     write_ambiguity(root, workers=1)
     assert any(entry["view_ambiguity"] < 1 for entry in entries(root))
+    assert validate(root, workers=1).valid
+    balls.rename(tmp_path / "elsewhere")
+    assert validate(root, workers=1).valid  # what cannot be recomputed is noted
+    (tmp_path / "elsewhere").rename(balls)
     for name in SCENES:
         folder = root / "train_synthetless" / name
         cameras = json.loads((folder / "scene_camera.json").read_text())
