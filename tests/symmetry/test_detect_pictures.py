@@ -14,7 +14,7 @@ from synthetless.io.meshes import TriangleMesh
 from synthetless.symmetry import SymmetryGroup, SymmetryTable
 from synthetless.symmetry.detection.detect import measure
 from synthetless.symmetry.detection.pictures import draw_table, picture
-from synthetless.symmetry.table import SymmetryEntry
+from synthetless.symmetry.table import QuasiSymmetry, SymmetryEntry
 
 VIEWS_PX, HEAD_PX = 1200, 34
 
@@ -66,3 +66,16 @@ def test_tables_are_drawn_for_the_meshes_that_are_there(tmp_path: Path) -> None:
     assert cv2.imread(str(path)).shape == (434, 1320, 3)
     with pytest.raises(ValueError, match="holds none of the table's objects, 9"):
         draw_table(SymmetryTable({9: table.entries[9]}), tmp_path, tmp_path / "pictures")
+
+
+def test_a_quasi_symmetry_is_drawn_below_with_the_detail_coloured(tmp_path: Path) -> None:
+    """A box that is not square is coloured where a quarter turn misses it."""
+    box(30, 38, 80).export(tmp_path / "obj_000001.ply")
+    exact, larger = SymmetryGroup.from_name("D2"), SymmetryGroup.from_name("D4")
+    table = SymmetryTable({1: SymmetryEntry(exact, quasi=QuasiSymmetry(larger, 6.0))})
+    draw_table(table, tmp_path, tmp_path / "pictures", workers=1)
+    image = cv2.imread(str(tmp_path / "pictures" / "obj_000001.png"))
+    assert image is not None
+    upper, lower = (saturation(half[..., ::-1].astype(np.uint8)) for half in np.split(image, 2))
+    assert (upper > 60).mean() < 0.02
+    assert (lower > 60).mean() > 0.1

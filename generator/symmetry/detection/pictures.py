@@ -31,7 +31,7 @@ from synthetless.symmetry.detection.report import group_cells
 from synthetless.symmetry.detection.residual import GroupFit, moved, spread_elements
 from synthetless.symmetry.groups import SymmetryGroup
 from synthetless.symmetry.quaternions import Floats, normalise
-from synthetless.symmetry.table import SymmetryTable
+from synthetless.symmetry.table import SymmetryEntry, SymmetryTable
 
 Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -50,7 +50,7 @@ _TOLERANCE_PERCENT = 1.0  # of the diameter: the scale of a table's picture does
 
 
 def draw_detected(detected: DetectedFolder, to: Path, workers: int | None = None) -> None:
-    """Draw every object with its group and, below, the next larger one.
+    """Draw every object with its group and, below, its quasi-symmetry group or else the next larger one.
 
     Args:
         detected: what `detect_folder` found.
@@ -67,7 +67,7 @@ def draw_detected(detected: DetectedFolder, to: Path, workers: int | None = None
             target=to / f"obj_{o.obj_id:06d}.png",
             title=f"object {o.obj_id}",
             tolerance_percent=100 * o.detected.tolerance_mm / o.detected.diameter_mm,
-            shown=tuple(f for f in (o.detected.answer, o.detected.next_larger) if f is not None),
+            shown=tuple(f for f in (o.detected.answer, o.quasi or o.detected.next_larger) if f is not None),
         )
         for o in detected.objects
     ]
@@ -76,6 +76,8 @@ def draw_detected(detected: DetectedFolder, to: Path, workers: int | None = None
 
 def draw_table(table: SymmetryTable, models: Path, to: Path, workers: int | None = None) -> None:
     """Draw the objects of a symmetry table whose meshes a folder holds; arguments and errors as in `draw_detected`.
+
+    A quasi-symmetry group is drawn below the exact one: where the surface is coloured is the detail between them.
 
     Raises:
         UserError: the folder holds none of the table's objects.
@@ -90,11 +92,15 @@ def draw_table(table: SymmetryTable, models: Path, to: Path, workers: int | None
             to / f"obj_{obj_id:06d}.png",
             f"object {obj_id}",
             _TOLERANCE_PERCENT,
-            (table.entries[obj_id].group,),
+            _groups_of(table.entries[obj_id]),
         )
         for obj_id, path in paths.items()
     ]
     _draw_all(tasks, workers)
+
+
+def _groups_of(entry: SymmetryEntry) -> tuple[SymmetryGroup, ...]:
+    return (entry.group,) if entry.quasi is None else (entry.group, entry.quasi.group)
 
 
 @dataclass(frozen=True)
