@@ -478,3 +478,65 @@ if __name__ == "__main__":
     relabel(root, scheme="atlas", workers=1)
     assert contents(root) == contents(relabelled)
     assert process.stdout.read() == b"", "its end is seen when no worker holds it any more"
+
+
+# What an attacker may have planted
+
+
+def _planted(root: Path, outside: Path, kind: str) -> None:
+    match kind:
+        case "folder of an older protocol":
+            (root / ".relabel").mkdir()
+            (root / ".relabel" / "link").symlink_to(outside)
+            (root / ".relabel" / "dataset.json").write_text("{}")
+            (root / "link").symlink_to(outside)
+        case "draft that is a link":
+            (root / ".relabel.draft").symlink_to(outside)
+        case "draft with links":
+            (root / ".relabel.draft").mkdir()
+            (root / ".relabel.draft" / "link").symlink_to(outside)
+        case "labels that are a link":
+            path = root / SPLIT / "000001" / "scene_gt_canonical.json"
+            path.unlink()
+            path.symlink_to(outside / "victim.txt")
+        case "table that is a link":
+            text = (root / "symmetries.json").read_text()
+            (root / "symmetries.json").unlink()
+            (outside / "table.json").write_text(text)
+            (root / "symmetries.json").symlink_to(outside / "table.json")
+        case "pending table that is a link":
+            (outside / "table.json").write_text((root / "symmetries.json").read_text())
+            (root / ".symmetries.json").symlink_to(outside / "table.json")
+        case "lock that is a link":
+            (root / ".synthetless.lock").symlink_to(outside / "victim.txt")
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "folder of an older protocol",
+        "draft that is a link",
+        "draft with links",
+        "labels that are a link",
+        "table that is a link",
+        "pending table that is a link",
+        "lock that is a link",
+    ],
+)
+@pytest.mark.parametrize("command", ["relabel", "assemble"])
+def test_nothing_outside_is_written(
+    root: Path, models: dict[int, ObjectModel], tmp_path: Path, kind: str, command: str
+) -> None:
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "victim.txt").write_text("dear")
+    _planted(root, outside, kind)
+    before = contents(outside)
+    try:
+        if command == "relabel":
+            relabel(root, scheme="atlas", workers=1)
+        else:
+            open_dataset(root, models).finish()
+    except ValueError as error:
+        assert "\n" not in str(error)
+    assert contents(outside) == before
