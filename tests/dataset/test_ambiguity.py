@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
+import os
 import shutil
+import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -158,6 +162,52 @@ def test_it_goes_on_where_it_was_interrupted(root: Path, monkeypatch: pytest.Mon
     assert write_ambiguity(root, eps_mm=5.0, workers=1).made == 1
     assert write_ambiguity(root, with_poses=True, workers=2).made == 2
     assert contents(root) == before
+
+
+def _killed_at(step: int, root: Path) -> None:
+    """Judge with another eps, and die before the step-th change on the disk."""
+    left = step
+
+    def or_die(real: Callable[..., None]) -> Callable[..., None]:
+        def change(*arguments: Any) -> None:
+            nonlocal left
+            left -= 1
+            if left == 0:
+                os.kill(os.getpid(), signal.SIGKILL)
+            real(*arguments)
+
+        return change
+
+    for name in ("write_json", "remove_file", "replace_file"):
+        setattr(module, name, or_die(getattr(module, name)))
+    write_ambiguity(root, eps_mm=5.0, workers=1)
+
+
+def _is_former(root: Path) -> bool:
+    stamp = root / "ambiguity.json"
+    return stamp.exists() and json.loads(stamp.read_text())["eps_mm"] is None
+
+
+def test_a_kill_before_any_change_on_disk_loses_nothing(judged: Path, tmp_path: Path) -> None:
+    whole = Path(shutil.copytree(judged, tmp_path / "whole"))
+    write_ambiguity(whole, eps_mm=5.0, workers=1)
+    steps = 0
+    while True:
+        root = Path(shutil.copytree(judged, tmp_path / "d"))
+        child = multiprocessing.get_context("fork").Process(target=_killed_at, args=(steps + 1, root))
+        child.start()
+        child.join()
+        if child.exitcode == 0:
+            break
+        assert child.exitcode == -signal.SIGKILL
+        seen = [instance.quasi for image in Dataset.open(root) for instance in image.instances]
+        assert all(quasi is None or (quasi.eps_mm == 5.0) == (not _is_former(root)) for quasi in seen)
+        write_ambiguity(root, eps_mm=5.0, workers=1)
+        assert contents(root) == contents(whole)
+        shutil.rmtree(root)
+        steps += 1
+    assert steps >= 6
+    assert contents(root) == contents(whole)
 
 
 def test_datasets_of_others(root: Path, tmp_path: Path) -> None:
