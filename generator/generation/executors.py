@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import os
 import platform
-import signal
 import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import count, islice
-from multiprocessing import connection, get_context, resource_tracker
+from multiprocessing import connection, get_context
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
@@ -32,6 +31,7 @@ from synthetless.generation import devices
 from synthetless.generation.devices import CPU, Devices
 from synthetless.generation.drop import DropFailed, DropRenderer
 from synthetless.generation.sources import Sources, load_sources
+from synthetless.io.parallel import without_interrupts
 from synthetless.scenes.blender import BlenderError, RenderDevice, console_to
 
 FAULT_VARIABLE = "SYNTHETLESS_FAULTS"
@@ -238,7 +238,7 @@ class _LocalPool:
         process = context.Process(target=_serve, args=(theirs, self._config, log), daemon=True)
         worker = _Worker(process, ours, log, time.monotonic())
         try:
-            with _without_interrupts(), console_to(log):
+            with without_interrupts(), console_to(log):
                 process.start()
                 self._workers.append(worker)
         except OSError as error:  # no memory, or no process, is left for it
@@ -325,17 +325,6 @@ def _serve(pipe: Connection, config: WorkerConfig, log: Path) -> None:
                 pipe.send(worker.make(pipe.recv(), commit))
         except (UserError, BlenderError) as error:
             pipe.send(error)
-
-
-@contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Processes that are started meanwhile never see Ctrl-C, which is for this one to answer, afterwards."""
-    resource_tracker.ensure_running()  # the first start of a process would start it, and let interrupts in again
-    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
 def _inject_fault(drop: int) -> None:

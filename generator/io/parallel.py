@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context
+from multiprocessing import active_children, connection, get_context, parent_process, resource_tracker
 from typing import Protocol, TypeVar
 
-from pebble import ProcessExpired, ProcessPool
 from tqdm import tqdm
 
 Task = TypeVar("Task")
@@ -47,24 +48,24 @@ def processes(wanted: int | None, most: int) -> Iterator[Map]:
     if count <= 1:
         yield lambda function, tasks, chunksize=1: map(function, tasks)
         return
-    with ProcessPool(count, initializer=_ignore_interrupt, context=get_context("spawn")) as pool:
+    others = set(active_children())
+    pool = ProcessPoolExecutor(count, get_context("spawn"), _prepare)
 
-        def map_in_pool(
-            function: Callable[[Task], Result], tasks: Sequence[Task], chunksize: int = 1
-        ) -> Iterator[Result]:
-            try:
-                return iter(pool.map(function, tasks, chunksize=chunksize).result())
-            except RuntimeError:  # all that pebble says of a pool whose processes have died
-                raise BrokenProcessPool from None
+    def map_in_pool(function: Callable[[Task], Result], tasks: Sequence[Task], chunksize: int = 1) -> Iterator[Result]:
+        with without_interrupts():  # the processes are started here
+            return pool.map(function, tasks, chunksize=chunksize)
 
-        try:
-            yield map_in_pool
-        except BaseException as error:
-            pool.stop()  # or whoever pressed Ctrl-C would wait for the tasks that are under way
-            if isinstance(error, ProcessExpired | BrokenProcessPool):
-                told = "a worker process was killed, perhaps for lack of memory; run it again"
-                raise ChildProcessError(told) from None
-            raise
+    try:
+        yield map_in_pool
+        pool.shutdown()
+    except BaseException as error:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in set(active_children()) - others:
+            process.kill()  # or whoever pressed Ctrl-C would wait for the tasks that are under way
+        if isinstance(error, BrokenProcessPool):
+            told = "a worker process was killed, perhaps for lack of memory; run it again"
+            raise ChildProcessError(told) from None
+        raise
 
 
 def each(
@@ -82,5 +83,24 @@ def watched(
     return iter(tqdm(run(function, tasks), total=len(tasks), desc=what, unit=unit, disable=None))
 
 
-def _ignore_interrupt() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to answer
+@contextmanager
+def without_interrupts() -> Iterator[None]:
+    """Processes that are started meanwhile never see Ctrl-C, which is for this one to answer, afterwards."""
+    resource_tracker.ensure_running()  # the first start of a process would start it, and let interrupts in again
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+def _prepare() -> None:
+    """In each process: end with the one that started it, however that ends; its pipes alone do not tell."""
+    parent = parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+
+
+def _end_with(sentinel: int) -> None:
+    connection.wait([sentinel])
+    os._exit(1)

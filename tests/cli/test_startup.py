@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 import pytest
 
-HEAVY = {"numpy", "scipy", "trimesh", "cv2", "PIL", "matplotlib", "yaml", "tqdm", "pebble", "rich", "bpy"}
+HEAVY = {"numpy", "scipy", "trimesh", "cv2", "PIL", "matplotlib", "yaml", "tqdm", "rich", "bpy"}
 COMMAND = "import sys; sys.argv[0] = 'synthetless'; from synthetless.cli.app import main; main()"
 COMPLETION = {
     "_SYNTHETLESS_COMPLETE": "complete_bash",
