@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from synthetless.dataset.labels import BOX_EDGES
 from synthetless.dataset.reader import Dataset, Image, Instance
 from synthetless.errors import UserError
 from synthetless.io.files import atomic_write, read_bytes, read_json
@@ -28,7 +29,6 @@ from synthetless.learning.train import Parts, choose_device, read_run
 Floats = NDArray[np.float64]
 
 _TRUE, _PREDICTED = (60, 200, 60), (230, 60, 40)
-_EDGES = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
 _SHOWN = 0.5
 
 
@@ -180,7 +180,7 @@ def _draw_box(
     if (seen[:, 2] <= 0).any():
         return
     at = np.clip(seen[:, :2] / seen[:, 2:], -1e4, 1e4).round().astype(int)
-    for a, b in _EDGES:
+    for a, b in BOX_EDGES:
         cv2.line(canvas, at[a].tolist(), at[b].tolist(), color, 1, cv2.LINE_AA)
 
 

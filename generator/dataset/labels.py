@@ -56,11 +56,12 @@ def label_scene(
         raise ValueError(f"objects {sorted(found - wanted)} are not to be labelled, and there are no stored labels")
     kept = [] if stored is None else [label for im_id in scene_gt for label in stored[im_id]]
     labels = dict(enumerate(kept))
+    K = poses.K
     for obj_id in sorted(wanted):
         corners_mm = _corners_of(obj_id, models_info)
         rows = np.flatnonzero(poses.obj_ids == obj_id)
         canonical = _canonical(poses, rows, table.canonical_map(obj_id))
-        corners_px = project(poses.K[rows], canonical, corners_mm)
+        corners_px = project(K[rows], canonical, corners_mm)
         labels |= zip(rows.tolist(), _entries(obj_id, canonical, corners_px), strict=True)
     rows_in_turn = iter(range(len(poses.obj_ids)))
     return {im_id: [labels[next(rows_in_turn)] for _ in entries] for im_id, entries in scene_gt.items()}

@@ -32,6 +32,7 @@ import numpy as np
 from synthetless.errors import UserError
 from synthetless.io.documents import read_document, shown
 from synthetless.io.files import atomic_write
+from synthetless.io.models import INFO_FILE
 from synthetless.symmetry.atlas import SCHEMES, Scheme, former_anchors
 from synthetless.symmetry.canonical import FULL_DECIMALS, CanonicalMap, check_decimals
 from synthetless.symmetry.groups import SymmetryGroup
@@ -40,7 +41,6 @@ from synthetless.symmetry.point_groups import parse_name
 Matrix = tuple[tuple[float, ...], ...]
 
 TABLE_FILE = "symmetries.json"
-MODELS_INFO_FILE = "models_info.json"
 
 TABLE_KEYS = ("scheme", "allocentric", "decimals", "objects")
 
@@ -164,7 +164,7 @@ class SymmetryTable:
             UserError: it is not a mapping of object ids to entries, or names an object twice.
         """
         entries, faults = {}, {}
-        for obj_id, info in _by_id(models_info, f"{MODELS_INFO_FILE} maps object ids to diameters and boxes").items():
+        for obj_id, info in _by_id(models_info, f"{INFO_FILE} maps object ids to diameters and boxes").items():
             if obj_id not in but:
                 try:
                     entries[obj_id] = SymmetryEntry(SymmetryGroup.from_bop(info, f"object {obj_id}"))
@@ -214,7 +214,7 @@ class SymmetryTable:
         file = _file_of(Path(path))
         content = read_document(file)
         try:
-            return cls.from_models_info(content) if file.name == MODELS_INFO_FILE else cls.from_dict(content)
+            return cls.from_models_info(content) if file.name == INFO_FILE else cls.from_dict(content)
         except UserError as error:
             raise UserError(f"{file}: {error}") from error
 
@@ -432,11 +432,9 @@ def _suggestion(word: str, known: Iterable[str]) -> str:
 def _file_of(path: Path) -> Path:
     if not path.is_dir():
         return path
-    found = [path / name for name in (TABLE_FILE, MODELS_INFO_FILE) if (path / name).exists()]
+    found = [path / name for name in (TABLE_FILE, INFO_FILE) if (path / name).exists()]
     if not found:
-        raise UserError(
-            f"{path}: holds neither {TABLE_FILE} nor {MODELS_INFO_FILE}; symmetries detect can write a table"
-        )
+        raise UserError(f"{path}: holds neither {TABLE_FILE} nor {INFO_FILE}; symmetries detect can write a table")
     return found[0]
 
 

@@ -15,14 +15,14 @@ from synthetless.errors import UserError
 from synthetless.io.documents import read_document, shown
 from synthetless.io.files import atomic_write, write_json
 from synthetless.io.meshes import read_mesh
-from synthetless.io.models import find_meshes
+from synthetless.io.models import INFO_FILE, find_meshes
 from synthetless.io.parallel import each
 from synthetless.symmetry.atlas import SCHEMES, Scheme
 from synthetless.symmetry.detection.detect import Detected, detect, measure
 from synthetless.symmetry.detection.quasi import quasi_fit
 from synthetless.symmetry.detection.residual import GroupFit
 from synthetless.symmetry.groups import SymmetryGroup
-from synthetless.symmetry.table import MODELS_INFO_FILE, QuasiSymmetry, SymmetryEntry, SymmetryTable, object_id
+from synthetless.symmetry.table import QuasiSymmetry, SymmetryEntry, SymmetryTable, object_id
 
 _TOLERANCE = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(mm|%)\s*")
 _SMALL_FOLDER_MM = 20.0  # of a folder whose largest part is smaller than this the units are asked about
@@ -187,7 +187,7 @@ class DetectedFolder:
         for target, o in targets.items():
             if not target.exists():
                 atomic_write(target, self._ply(o))
-        write_json(to / MODELS_INFO_FILE, {str(o.obj_id): _models_info(o) for o in self.objects})
+        write_json(to / INFO_FILE, {str(o.obj_id): _models_info(o) for o in self.objects})
 
     def _ply(self, o: DetectedObject) -> bytes:
         mesh = read_mesh(o.path, self.scale)
@@ -263,7 +263,7 @@ def _detect_file(task: _Task) -> DetectedObject:
 
 
 def _declared(folder: Path) -> dict[int, SymmetryGroup]:
-    path = folder / MODELS_INFO_FILE
+    path = folder / INFO_FILE
     if not path.exists():
         return {}
     table = SymmetryTable.read(path)
