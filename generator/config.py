@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import difflib
 import json
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
@@ -18,11 +20,13 @@ from pydantic import Field, ValidationError
 from synthetless import assets
 from synthetless.errors import UserError
 from synthetless.io.documents import parse_document, read_document, shown
+from synthetless.io.files import atomic_write
 from synthetless.scenes.settings import SENSORS, Bounds, SceneSettings, SensorSettings, Settings
 from synthetless.scenes.spec import Intrinsics
 
 BUILTIN = "builtin"
 BUILTIN_MODELS = Path(assets.__file__).parent / "parts"
+BUILTIN_RECIPES = Path(__file__).parent / "configs"
 Tree = TypeVar("Tree", bound=Settings)
 SPLIT = "train_synthetless"
 """The folder of scenes, if a recipe names no other."""
@@ -108,8 +112,58 @@ class Setting:
     description: str
 
 
+def builtin_recipes() -> dict[str, Path]:
+    """The recipes and trainings that come with the package, by name: their places in configs/, without the suffix."""
+    files = sorted(BUILTIN_RECIPES.rglob("*.yaml"))
+    return {file.relative_to(BUILTIN_RECIPES).with_suffix("").as_posix(): file for file in files}
+
+
+def recipe_file(name: Path) -> Path:
+    """The file that is meant by a name or a path: the user's own, or else one that comes with the package.
+
+    Raises:
+        RecipeError: there is neither.
+    """
+    known = builtin_recipes()
+    if name.as_posix() in known and not name.is_file():  # a folder may well be called demo
+        return known[name.as_posix()]
+    if name.exists():
+        return name
+    near = difflib.get_close_matches(name.as_posix(), known, n=1)
+    meant = f"did you mean {near[0]}?" if near else "`synthetless recipes` lists those that come with it"
+    raise RecipeError(f"{name}: no such recipe file; {meant}")
+
+
+def recipe_summary(file: Path) -> str:
+    """The first sentence of the comment that a recipe begins with."""
+    lines = takewhile(lambda line: line.startswith("# "), file.read_text(encoding="utf-8").splitlines())
+    comment = " ".join(line.removeprefix("# ") for line in lines)
+    return re.split(r"(?<=[a-z)\d])[.:;](?: |$)", comment, maxsplit=1)[0]
+
+
+def copy_recipe(name: str, to: Path | None = None) -> Path:
+    """Write a recipe that comes with the package to a new file; in this folder, if none is given.
+
+    Raises:
+        RecipeError: there is no such recipe.
+        UserError: the file exists already.
+    """
+    known = builtin_recipes()
+    if name not in known:
+        raise RecipeError(f"--copy {name}: no such recipe; one of {', '.join(known)} is needed")
+    place = to or Path(known[name].name)
+    if place.exists():
+        raise UserError(f"{place}: exists already; give a new name with --to")
+    atomic_write(place, known[name].read_bytes())
+    return place
+
+
 def load_recipe(path: Path | None, overrides: Sequence[str] = ()) -> Recipe:
-    """Read a recipe and apply ``key.path=value`` overrides (values are YAML); errors as in ``load_settings``."""
+    """Read a recipe, by its file or its name, and apply ``key.path=value`` overrides (values are YAML).
+
+    Raises:
+        RecipeError: as in ``load_settings``.
+    """
     return load_settings(Recipe, path, overrides)
 
 
@@ -161,10 +215,8 @@ def settings(group: type[Settings] = Recipe, prefix: str = "") -> Iterator[Setti
 
 
 def _read_recipe(path: Path) -> dict[str, Any]:
-    if not path.exists():
-        raise RecipeError(f"{path}: no such recipe file")
     try:
-        content = read_document(path)
+        content = read_document(recipe_file(path))
     except UserError as error:
         raise RecipeError(str(error)) from None
     if content is None:

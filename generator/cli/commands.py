@@ -37,6 +37,9 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
+fetch = typer.Typer(
+    help="Get the T-LESS models or the Describable Textures.", no_args_is_help=True, rich_markup_mode=None
+)
 export = typer.Typer(help="Write a dataset in other formats.", no_args_is_help=True, rich_markup_mode=None)
 symmetries = typer.Typer(
     help="Find the symmetry groups of parts, and see what they mean.", no_args_is_help=True, rich_markup_mode=None
@@ -44,8 +47,11 @@ symmetries = typer.Typer(
 
 # In the order in which one needs them.
 app.command("doctor")(inspect.doctor_command)
-app.command("fetch")(data.fetch_command)
-app.command("generate", cls=generate.GenerateCommand)(generate.generate_command)
+app.add_typer(fetch, name="fetch")
+fetch.command("tless")(data.fetch_tless_command)
+fetch.command("dtd")(data.fetch_dtd_command)
+app.command("recipes")(inspect.recipes_command)
+app.command("generate")(generate.generate_command)
 app.command("preview")(inspect.preview_command)
 app.command("validate")(inspect.validate_command)
 app.command("relabel")(labels.relabel_command)

@@ -9,20 +9,32 @@ from typing import Annotated, Literal
 
 import typer
 
-from synthetless.cli.options import Split
+from synthetless.cli.options import AsJson, Split
 from synthetless.cli.terminal import say
 
+FetchTo = Annotated[Path, typer.Option(metavar="DIR", help="Folder to put them into.")]
+FetchFrom = Annotated[
+    str | None, typer.Option("--from", metavar="PLACE", help="Archive, folder or address to take them from.")
+]
 
-def fetch_command(
-    what: Annotated[Literal["tless", "dtd"], typer.Argument(help="T-LESS CAD models, or Describable Textures.")],
-    to: Annotated[Path, typer.Option(metavar="DIR", help="Folder to put them into.")],
-    source: Annotated[str | None, typer.Option("--from", help="Archive, folder or address to take them from.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
-) -> None:
-    """Get the T-LESS models or the Describable Textures.
+
+def fetch_tless_command(to: FetchTo, source: FetchFrom = None, as_json: AsJson = False) -> None:
+    """Get the 30 CAD models of T-LESS.
+
+    They come from where BOP publishes them, are checked, and bring their licence.
+    """
+    _fetch("tless", to, source, as_json)
+
+
+def fetch_dtd_command(to: FetchTo, source: FetchFrom = None, as_json: AsJson = False) -> None:
+    """Get the photographs of the Describable Textures, for the table.
 
     They come from where they are published, are checked, and bring their licence.
     """
+    _fetch("dtd", to, source, as_json)
+
+
+def _fetch(what: Literal["tless", "dtd"], to: Path, source: str | None, as_json: bool) -> None:
     from synthetless.fetch import fetch
 
     report = fetch(what, to, source)
@@ -39,6 +51,7 @@ def coco_command(
         Literal["visible", "amodal"], typer.Option(help="Around the visible pixels, or around the whole object.")
     ] = "visible",
     split: Split = None,
+    as_json: AsJson = False,
 ) -> None:
     """Write one COCO file for the whole split.
 
@@ -49,7 +62,7 @@ def coco_command(
 
     with undisturbed(dataset, may_grow=True):
         count = export_coco(dataset, to, split, boxes)
-    say(f"{count} images in {to}")
+    say(json.dumps({"images": count, "file": str(to)}) if as_json else f"{count} images in {to}")
 
 
 def webdataset_command(
@@ -59,6 +72,7 @@ def webdataset_command(
     shuffle_seed: Annotated[int | None, typer.Option(metavar="N", help="Shuffle the images by this seed.")] = None,
     relabel_only: Annotated[bool, typer.Option("--relabel-only", help="Renew the labels of existing shards.")] = False,
     split: Split = None,
+    as_json: AsJson = False,
 ) -> None:
     """Write BOP webdataset shards.
 
@@ -69,8 +83,14 @@ def webdataset_command(
 
     with undisturbed(dataset, may_grow=True):
         if relabel_only:
-            relabel_webdataset(dataset, to, split)
-            say(f"labels replaced in {to}")
+            keys = relabel_webdataset(dataset, to, split)
+            say(
+                json.dumps({"images": len(keys), "shards": len(set(keys.values())), "folder": str(to)})
+                if as_json
+                else f"labels replaced in {to}"
+            )
             return
         shards = export_webdataset(dataset, to, split, images_per_shard, shuffle_seed)
-    say(f"{len(shards)} images in {len(set(shards.values()))} shards in {to}")
+    images, count = len(shards), len(set(shards.values()))
+    answer = {"images": images, "shards": count, "folder": str(to)}
+    say(json.dumps(answer) if as_json else f"{images} images in {count} shards in {to}")

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from typer.core import TyperCommand
 
-from synthetless.cli.options import Workers
+from synthetless.cli.options import AsJson, RecipeArgument, Workers
+from synthetless.cli.progress import display
 from synthetless.cli.terminal import EXIT_FAILED, EXIT_INTERRUPTED, leave, say
 from synthetless.errors import UserError
-from synthetless.scenes.blender import Kind
+from synthetless.scenes.blender import KINDS, Kind
 
 if TYPE_CHECKING:
     from synthetless.config import Recipe
@@ -23,16 +23,14 @@ if TYPE_CHECKING:
 Device = Literal["auto", Kind]
 
 
-class GenerateCommand(TyperCommand):
-    """Has the settings of a recipe below its help; they are read only when the help is asked for."""
-
-    def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        self.epilog = settings_help()
-        super().format_epilog(ctx, formatter)
+def _print_settings(wanted: bool) -> None:
+    if wanted:
+        say(settings_help())
+        raise typer.Exit
 
 
 def settings_help() -> str:
-    """All settings of a recipe, a paragraph for each group; \\b keeps it as it is laid out."""
+    """All settings of a recipe, a paragraph for each group."""
     import textwrap
     from itertools import groupby
 
@@ -40,92 +38,97 @@ def settings_help() -> str:
 
     paragraphs = []
     for _, group in groupby(settings(), key=lambda setting: setting.key.rpartition(".")[0]):
-        lines = ["\b"]
+        lines = []
         for setting in group:
             lines.append(f"{setting.key}={json.dumps(setting.default)}")
-            lines.append(textwrap.indent(textwrap.fill(" ".join(setting.description.split()), 72), "    "))
+            lines.append(textwrap.indent(textwrap.fill(" ".join(setting.description.split()), 76), "    "))
         paragraphs.append("\n".join(lines))
     return "\n\n".join(["Settings of a recipe, for --set (docs/recipe.md has units and ranges):", *paragraphs])
 
 
 def generate_command(
-    recipe: Annotated[Path, typer.Argument(help="The recipe, a YAML file.")],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the dataset. Run again to continue it.")],
-    images: Annotated[
-        int | None, typer.Option(metavar="N", help="How many images; more than before extends the dataset.")
-    ] = None,
+    recipe: RecipeArgument,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="The dataset's folder; again to continue it.")],
+    images: Annotated[int | None, typer.Option(metavar="N", help="How many; more than before extends it.")] = None,
     seed: Annotated[int | None, typer.Option(metavar="N", help="Everything random follows from it.")] = None,
     models: Annotated[
-        str | None,
-        typer.Option(metavar="DIR", help="CAD models as in BOP (obj_000001.ply, ..., models_info.json), or builtin."),
+        str | None, typer.Option(metavar="DIR", help="CAD models as in BOP (with models_info.json), or builtin.")
     ] = None,
     textures: Annotated[str | None, typer.Option(metavar="DIR", help="Photographs, or builtin.")] = None,
     overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change a setting; may be given several times."),
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a setting. Repeatable.")
     ] = None,
+    help_settings: Annotated[
+        bool,
+        typer.Option("--help-settings", callback=_print_settings, is_eager=True, help="List the settings, and exit."),
+    ] = False,
     workers: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Processes; default: one per core, or per GPU.")
+        int | None, typer.Option(min=1, metavar="N", help="Processes; default: one per core or GPU.")
     ] = None,
-    threads: Annotated[int, typer.Option(min=0, metavar="N", help="Threads of each process; 0: as many as cores.")] = 1,
-    on: Annotated[Device, typer.Option("--device", help="What to render on; auto takes the best.")] = "auto",
+    threads: Annotated[int, typer.Option(min=0, metavar="N", help="Of each process; 0: as many as cores.")] = 1,
+    on: Annotated[
+        Device, typer.Option("--device", metavar="KIND", help=f"To render on: auto (the best), {', '.join(KINDS)}.")
+    ] = "auto",
     drop_limit: Annotated[
-        float, typer.Option(min=1, metavar="SECONDS", help="Give up a drop after so many seconds.")
+        float, typer.Option(min=1, metavar="SECONDS", help="Give up a drop that takes longer.")
     ] = 1800,
     part: Annotated[
-        str | None,
-        typer.Option(metavar="K/N", help="Make part K of N of the drops, beside other machines that make the others."),
+        str | None, typer.Option(metavar="K/N", help="Make part K of N; other machines make the others.")
     ] = None,
-    executor: Annotated[
-        Literal["local", "ray"], typer.Option(help="Processes of this machine, or a Ray cluster.")
-    ] = "local",
+    executor: Annotated[Literal["local", "ray"], typer.Option(help="This machine, or a Ray cluster.")] = "local",
     address: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="Of the Ray cluster; default: the one that runs here.")
+        str | None, typer.Option(metavar="HOST:PORT", help="Of the Ray cluster; default: the one here.")
     ] = None,
     preview_every: Annotated[
-        int, typer.Option(min=0, metavar="N", help="Draw the contact sheet after every N images, too; 0: in the end.")
+        int, typer.Option(min=0, metavar="N", help="Images between contact sheets; 0: one at the end.")
     ] = 50,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only tell what it would take; two images are made to measure.")
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only tell what it would take, as measured.")] = False,
+    no_cache: Annotated[bool, typer.Option("--no-cache", help="Make meshes' colliders anew, and keep none.")] = False,
+    json_progress: Annotated[
+        bool, typer.Option("--json-progress", help="Tell progress on stderr as lines of JSON.")
     ] = False,
-    no_cache: Annotated[
-        bool, typer.Option("--no-cache", help="Compute meshes' colliders anew, and keep nothing in the cache folder.")
-    ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Make a dataset: drop, render, measure, label, write.
 
-    Example: synthetless generate configs/demo.yaml --out out/demo --set camera.distance_m='[0.5, 0.8]'
+    Example: synthetless generate demo --out out/demo --set camera.distance_m='[0.5, 0.8]'
     """
-    from synthetless.dataset.layout import Part
-    from synthetless.errors import UserError
-    from synthetless.generation import devices
-    from synthetless.generation.estimate import estimate
-    from synthetless.generation.generate import Execution, generate
-    from synthetless.io.cache import CACHE_VARIABLE
-
-    if no_cache:
-        os.environ[CACHE_VARIABLE] = "off"  # for the workers, too, which inherit it
     resolved = _resolve(recipe, overrides or [], images, seed, models, textures)
     if address is not None and executor != "ray":
         raise UserError(f"--address {address} is of a Ray cluster; add --executor ray")
-    execution = Execution(
-        workers,
-        threads,
-        drop_limit,
-        Part.parse(part) if part else None,
-        devices.choose(on) if executor == "local" else devices.Devices(on),
-        preview_every,
-        (address or "auto") if executor == "ray" else None,
-    )
+    if dry_run and executor == "ray":
+        raise UserError("--dry-run measures this machine; leave out --executor ray")
+    with display(json_progress) as tell:  # from here on it takes time
+        from synthetless.dataset.layout import Part
+        from synthetless.generation import devices
+        from synthetless.generation.estimate import estimate
+        from synthetless.generation.generate import Execution, generate
+        from synthetless.generation.progress import Progress
+        from synthetless.io.cache import CACHE_VARIABLE
+
+        if no_cache:
+            os.environ[CACHE_VARIABLE] = "off"  # for the workers, too, which inherit it
+        if executor == "local":
+            tell(Progress("looking for devices", "looking for devices"))
+        execution = Execution(
+            workers,
+            threads,
+            drop_limit,
+            Part.parse(part) if part else None,
+            devices.choose(on) if executor == "local" else devices.Devices(on),
+            preview_every,
+            (address or "auto") if executor == "ray" else None,
+        )
+        if dry_run:
+            plan = estimate(resolved, out, execution, tell)
+        else:
+            try:
+                summary = generate(resolved, out, execution, tell)
+            except KeyboardInterrupt:
+                leave("interrupted; run the same command again to continue", EXIT_INTERRUPTED)
     if dry_run:
-        plan = estimate(resolved, out, execution)
         say(json.dumps(asdict(plan)) if as_json else plan)
         return
-    try:
-        summary = generate(resolved, out, execution)
-    except KeyboardInterrupt:
-        leave("interrupted; run the same command again to continue", EXIT_INTERRUPTED)
     _report(summary, out, as_json)
     if summary.failures:
         raise typer.Exit(EXIT_FAILED)
@@ -179,6 +182,7 @@ def render_command(
     textures: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder of the photographs, if it has moved.")
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Render one recorded image again."""
     from synthetless.dataset.layout import refuse_target
@@ -190,7 +194,7 @@ def render_command(
     if to.exists():
         raise UserError(f"{to}: exists already; give a new name")
     atomic_write(to, encode_png(render_again(dataset, scene, image, textures)))
-    say(to)
+    say(json.dumps({"picture": str(to)}) if as_json else to)
 
 
 def redo_command(
@@ -199,6 +203,7 @@ def redo_command(
     textures: Annotated[
         str | None, typer.Option(metavar="DIR", help="Folder of the photographs, if it has moved.")
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Make one drop again, to see why it failed.
 
@@ -211,7 +216,8 @@ def redo_command(
         made = retry(dataset, drop, textures)
     except DropFailed as failure:
         leave(f"drop {drop}: {failure}", EXIT_FAILED)
-    say(f"drop {drop}: {made} images in {dataset}")
+    answer = {"drop": drop, "made": made, "dataset": str(dataset)}
+    say(json.dumps(answer) if as_json else f"drop {drop}: {made} images in {dataset}")
 
 
 def redevelop_command(
@@ -222,6 +228,7 @@ def redevelop_command(
         typer.Option("--set", metavar="KEY=VALUE", help="sensor=NAME, or a setting of sensor; several times."),
     ] = None,
     workers: Workers = None,
+    as_json: AsJson = False,
 ) -> None:
     """Make other pictures of the same scenes.
 
@@ -231,4 +238,5 @@ def redevelop_command(
     """
     from synthetless.generation.redevelop import redevelop
 
-    say(f"{redevelop(dataset, to, overrides or [], workers)} images in {to}")
+    count = redevelop(dataset, to, overrides or [], workers)
+    say(json.dumps({"images": count, "dataset": str(to)}) if as_json else f"{count} images in {to}")

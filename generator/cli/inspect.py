@@ -1,4 +1,4 @@
-"""Commands that look at things: doctor, preview, validate."""
+"""Commands that look at things: recipes, doctor, preview, validate."""
 
 from __future__ import annotations
 
@@ -8,8 +8,37 @@ from typing import Annotated
 
 import typer
 
-from synthetless.cli.options import Split, Workers
+from synthetless.cli.options import AsJson, Split, Workers
 from synthetless.cli.terminal import EXIT_FAILED, say
+
+
+def recipes_command(
+    copy: Annotated[str | None, typer.Option(metavar="NAME", help="Write this one to a file, to be edited.")] = None,
+    to: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Of the copy; default: its name in this folder.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the recipes that come with the package.
+
+    Examples: synthetless recipes --copy demo; synthetless generate demo.yaml --out out/mine
+    """
+    from synthetless.config import builtin_recipes, copy_recipe, recipe_summary
+    from synthetless.errors import UserError
+
+    if copy is not None:
+        written = copy_recipe(copy, to)
+        say(json.dumps({"recipe": str(written)}) if as_json else f"recipe: {written}")
+        return
+    if to is not None:
+        raise UserError(f"--to {to}: of which recipe? Add --copy NAME")
+    summaries = {name: recipe_summary(file) for name, file in builtin_recipes().items()}
+    if as_json:
+        say(json.dumps(summaries))
+        return
+    width = max(map(len, summaries))
+    for name, summary in summaries.items():
+        say(f"{name:<{width}}  {summary}")
 
 
 def doctor_command(

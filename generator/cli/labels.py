@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from synthetless.cli.options import Workers
+from synthetless.cli.options import AsJson, Workers, above_zero
 from synthetless.cli.terminal import say
 
 TableOption = Annotated[
@@ -49,18 +49,25 @@ def adopt_command(
     ] = None,
     symmetries: TableOption = None,
     scheme: SchemeOption = None,
+    as_json: AsJson = False,
 ) -> None:
     """Label an existing BOP dataset; its own files stay as they are."""
     from synthetless.dataset.relabel import adopt
 
-    say(adopt(dataset, models, symmetries, scheme))
+    done = adopt(dataset, models, symmetries, scheme)
+    answer = asdict(done) | {"models": str(done.models), "table": done.table.to_dict()}
+    say(json.dumps(answer) if as_json else done)
 
 
 def ambiguity_command(
     dataset: Annotated[Path, typer.Argument(help="Folder of a dataset that generate made, or that adopt labelled.")],
     eps_mm: Annotated[
         float | None,
-        typer.Option(metavar="E", help="Depths that differ by more are told apart. Default: what a pixel measures."),
+        typer.Option(
+            callback=above_zero,
+            metavar="E",
+            help="Depths that differ by more are told apart. Default: what a pixel measures.",
+        ),
     ] = None,
     what: Annotated[
         Literal["depth", "normals", "silhouette"], typer.Option(help="What is compared; for colour images normals.")
@@ -90,7 +97,7 @@ def detect_command(
         Path | None, typer.Option(metavar="DIR", help="BOP models folder to write, models_info.json too.")
     ] = None,
     tolerance_percent: Annotated[
-        float, typer.Option(min=0, metavar="PERCENT", help="Largest residual, in % of the diameter.")
+        float, typer.Option(callback=above_zero, metavar="PERCENT", help="Largest residual, in % of the diameter.")
     ] = 1.0,
     tolerance: Annotated[
         list[str] | None,
@@ -101,7 +108,8 @@ def detect_command(
         typer.Option(metavar="VALUE", help="Also find larger groups within 2mm or 3%, for ambiguity."),
     ] = None,
     scale: Annotated[
-        float, typer.Option(min=0, metavar="FACTOR", help="Millimetres per unit of the files; 1000 for metres.")
+        float,
+        typer.Option(callback=above_zero, metavar="FACTOR", help="Millimetres per unit of the files; 1000 for metres."),
     ] = 1.0,
     pictures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for a picture of each part.")] = None,
     workers: Workers = None,
@@ -130,17 +138,18 @@ def show_command(
     table: Annotated[Path, typer.Argument(help="Symmetry table, models_info.json, or a folder that holds one.")],
     models: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of the meshes, for pictures.")] = None,
     pictures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for a picture of each part.")] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Tell what a symmetry table means for the labels.
 
     Regressors, margins, and which views are dangerous.
     """
     from synthetless.symmetry import SymmetryTable
-    from synthetless.symmetry.detection.report import describe
+    from synthetless.symmetry.detection.report import describe, described
 
     read = SymmetryTable.read(table)
     if pictures is not None:
         from synthetless.symmetry.detection.pictures import draw_table
 
         draw_table(read, models or (table if table.is_dir() else table.parent), pictures)
-    say(describe(read))
+    say(json.dumps(described(read)) if as_json else describe(read))

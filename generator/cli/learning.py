@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
-from synthetless.cli.options import Split, Workers
+from synthetless.cli.options import AsJson, RecipeArgument, Split, Workers, above_zero
 from synthetless.cli.terminal import say
 
 _NO_LOSSES = ("step", "seconds", "seconds_left", "rate")
@@ -72,12 +73,17 @@ def compare_command(
     ] = "upright",
     margin_weight: Annotated[
         float | None,
-        typer.Option(metavar="DEGREES", help="Weight the loss by the margin, which counts in full from here on."),
+        typer.Option(
+            callback=above_zero,
+            metavar="DEGREES",
+            help="Weight the loss by the margin, which counts in full from here on.",
+        ),
     ] = None,
     rendered: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Dataset of the same parts to measure the networks on, too.")
     ] = None,
     workers: Workers = None,
+    as_json: AsJson = False,
 ) -> None:
     """Prove what the labels are worth.
 
@@ -101,9 +107,16 @@ def compare_command(
         full_weight_deg=margin_weight,
     )
     runs = compare(comparison, out, workers)
-    rows = [COLUMNS, *table_rows(runs, comparison.labels)]
+    of_crops = table_rows(runs, comparison.labels)
+    of_rendered = [] if rendered is None else table_rows(runs, comparison.labels, "rendered, all")
+    if as_json:
+        tables = {"crops": of_crops, "rendered": of_rendered}
+        named = {key: [dict(zip(COLUMNS, row, strict=True)) for row in rows] for key, rows in tables.items()}
+        say(json.dumps({"page": str(out / "index.html"), **named}))
+        return
+    rows = [COLUMNS, *of_crops]
     if rendered is not None:
-        rows += [("rendered:", *[""] * (len(COLUMNS) - 1)), *table_rows(runs, comparison.labels, "rendered, all")]
+        rows += [("rendered:", *[""] * (len(COLUMNS) - 1)), *of_rendered]
     widths = [max(len(row[i]) for row in rows) for i in range(len(COLUMNS))]
     for row in rows:
         say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
@@ -138,7 +151,7 @@ def _numbers(option: str, text: str) -> list[int]:
 
 
 def train_command(
-    config: Annotated[Path, typer.Argument(help="The training, a YAML file.")],
+    config: RecipeArgument,
     data: Annotated[list[Path], typer.Option(metavar="DIR", help="Folder of a dataset; may be given several times.")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the run. Give it again to continue it.")],
     labels: Annotated[
@@ -152,6 +165,7 @@ def train_command(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Change a setting; may be given several times."),
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Train the detector and its pose head.
 
@@ -168,12 +182,16 @@ def train_command(
     steps = training.schedule.steps
 
     def tell(record: dict[str, Any]) -> None:
+        if as_json:
+            print(json.dumps(record), file=sys.stderr, flush=True)
+            return
         shown = ", ".join(f"{name} {value:.3f}" for name, value in record.items() if name not in _NO_LOSSES)
         left = record["seconds_left"]
         say(f"step {record['step']} of {steps}: {shown}; {left / 60:.0f} min left")
 
     train(training, data, out, device, models, tell)
-    say(f"run: {out}\ncurves: {out / PAGE_FILE}")
+    answer = {"run": str(out), "curves": str(out / PAGE_FILE)}
+    say(json.dumps(answer) if as_json else f"run: {out}\ncurves: {out / PAGE_FILE}")
 
 
 def predict_command(
@@ -188,6 +206,7 @@ def predict_command(
         Path | None, typer.Option(metavar="FILE", help="BOP's camera.json, if DATASET is a plain folder of pictures.")
     ] = None,
     device: Annotated[str, typer.Option(metavar="NAME", help="auto, cpu, cuda, ...")] = "auto",
+    as_json: AsJson = False,
 ) -> None:
     """Predict poses with a trained detector.
 
@@ -197,4 +216,4 @@ def predict_command(
     from synthetless.learning.predict import predict
 
     count = predict(run, dataset, to, overlays, split, device, camera)
-    say(f"{count} poses in {to}")
+    say(json.dumps({"poses": count, "file": str(to)}) if as_json else f"{count} poses in {to}")

@@ -14,6 +14,7 @@ from synthetless.annotation.scene import annotate_scene, scene_caster
 from synthetless.config import Recipe
 from synthetless.dataset.layout import ImagePlan
 from synthetless.dataset.store import FinishedImage
+from synthetless.generation.progress import COLLIDERS, DROPPING, RENDERING, Report, Stage, unreported
 from synthetless.generation.sources import Sources
 from synthetless.io.cache import Cache, digest
 from synthetless.io.models import ObjectModel
@@ -75,23 +76,26 @@ class DropRenderer:
             log,
         )
 
-    def make(self, drop: int, plans: Sequence[ImagePlan]) -> Iterator[FinishedImage]:
+    def make(self, drop: int, plans: Sequence[ImagePlan], report: Report = unreported) -> Iterator[FinishedImage]:
         """Make images of one drop, one after the other.
 
         Args:
             drop: its number.
             plans: the images wanted of it.
+            report: is told what is done, as it begins.
 
         Raises:
             DropFailed: it never came to rest.
             UserError: an input file became unreadable.
         """
-        spec, settled = self.drop(drop)
+        spec, settled = self.drop(drop, report)
         with self.session.scene(spec, settled) as scene:
-            for plan in plans:
+            for number, plan in enumerate(plans):
+                detail = f"{number + 1} of {len(plans)}" if len(plans) > 1 else ""
+                report(Stage(RENDERING, detail, (1 + number) / (1 + len(plans))))  # the drop counts as an image
                 yield self._image(plan, scene, settled)
 
-    def drop(self, drop: int) -> tuple[SceneSpec, tuple[Pose, ...]]:
+    def drop(self, drop: int, report: Report = unreported) -> tuple[SceneSpec, tuple[Pose, ...]]:
         """Throw the objects until they come to rest.
 
         Returns:
@@ -105,11 +109,20 @@ class DropRenderer:
         for attempt in range(throws):
             spec = sample_scene(self._recipe, self._catalogue, self._recipe.seed, drop, attempt)
             try:
-                colliders = [self._collider((item.role, item.obj_id)) for item in spec.objects]
+                colliders = self._colliders_of(spec, report)
+                report(Stage(DROPPING, f"again, throw {attempt + 1}" if attempt else ""))
                 return spec, settle(colliders, [item.release for item in spec.objects], PhysicsSettings()).poses
             except NotSettled as failure:
                 reason = str(failure)
         raise DropFailed(f"did not come to rest in {throws} throws; the last time, {reason}")
+
+    def _colliders_of(self, spec: SceneSpec, report: Report) -> list[Collider]:
+        keys: list[ModelKey] = [(item.role, item.obj_id) for item in spec.objects]
+        new = list(dict.fromkeys(key for key in keys if key not in self._colliders))
+        for number, key in enumerate(new, start=1):
+            report(Stage(COLLIDERS, f"{number} of {len(new)}"))
+            self._collider(key)
+        return [self._collider(key) for key in keys]
 
     def _collider(self, key: ModelKey) -> Collider:
         if key not in self._colliders:

@@ -14,6 +14,7 @@ from synthetless.errors import UserError
 from synthetless.generation import devices
 from synthetless.generation.drop import DropRenderer
 from synthetless.generation.generate import Execution, wanted
+from synthetless.generation.progress import READING, STARTING, Tell, Tracker, silent
 from synthetless.generation.sources import Sources, check_photos, load_sources
 from synthetless.io.files import nearest_existing
 
@@ -67,7 +68,7 @@ class Estimate:
         )
 
 
-def estimate(recipe: Recipe, out: Path, execution: Execution) -> Estimate:
+def estimate(recipe: Recipe, out: Path, execution: Execution, tell: Tell = silent) -> Estimate:
     """Make a few images, keep none, and estimate what all of them would take.
 
     Raises:
@@ -77,15 +78,17 @@ def estimate(recipe: Recipe, out: Path, execution: Execution) -> Estimate:
     """
     if execution.cluster is not None:
         raise UserError("--dry-run measures this machine; leave out --executor ray")
+    tracker = Tracker(tell)
+    tracker.phase(READING)
     sources = load_sources(recipe)
-    check_photos(sources)
+    check_photos(sources, tracker)
     dataset = DatasetStore(out, recipe)
     if (out / DATASET_FILE).exists():
         dataset = DatasetStore.begun(out, recipe, sources.models, sources.scenery_digest)
     done, missing = dataset.done(), wanted(dataset, execution.part)
     views = recipe.camera.views_per_drop
     drops = {plan_image(number, views).drop for number in missing}
-    per_drop_s, per_image_s, image_bytes = _measure(recipe, sources, execution, sorted(drops)[:_PROBES])
+    per_drop_s, per_image_s, image_bytes = _measure(recipe, sources, execution, sorted(drops)[:_PROBES], tracker)
     seconds = len(drops) * per_drop_s + len(missing) * per_image_s
     models = 0 if (out / MODELS_FOLDER).exists() else sum(m.path.stat().st_size for m in sources.models.values())
     return Estimate(
@@ -104,15 +107,20 @@ def estimate(recipe: Recipe, out: Path, execution: Execution) -> Estimate:
     )
 
 
-def _measure(recipe: Recipe, sources: Sources, execution: Execution, drops: list[int]) -> tuple[float, float, int]:
+def _measure(
+    recipe: Recipe, sources: Sources, execution: Execution, drops: list[int], tracker: Tracker
+) -> tuple[float, float, int]:
     """Seconds of a drop, seconds and bytes of an image of it; what is done only once is not counted."""
     if not drops:
         return 0.0, 0.0, 0
+    tracker.phase(STARTING)
     renderer = DropRenderer(recipe, sources, execution.threads, devices.take(execution.devices))
     dropping, making, size = 0.0, 0.0, 0
     views = recipe.camera.views_per_drop
+    tracker.phase("measuring")
     list(renderer.make(drops[0], [plan_image(drops[0] * views, views)]))  # so that a GPU has compiled its programs
-    for drop in drops:
+    for number, drop in enumerate(drops, start=1):
+        tracker.phase("measuring", f"{number} of {len(drops)} images")
         plan = plan_image(drop * views, views)
         renderer.drop(drop)  # the objects' colliders are made once and kept
         began = time.perf_counter()

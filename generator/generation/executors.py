@@ -12,7 +12,7 @@ import platform
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import count, islice
@@ -30,6 +30,7 @@ from synthetless.errors import UserError
 from synthetless.generation import devices
 from synthetless.generation.devices import CPU, Devices
 from synthetless.generation.drop import DropFailed, DropRenderer
+from synthetless.generation.progress import COLLIDERS, STARTING, Report, Stage, Work, unreported
 from synthetless.generation.sources import Sources, load_sources
 from synthetless.io.parallel import without_interrupts
 from synthetless.scenes.blender import BlenderError, RenderDevice, console_to
@@ -52,6 +53,9 @@ _END_LIMIT_S = 10.0
 """How long a worker without work may take to end."""
 _TICK_S = 1.0
 """How often the time limits are checked."""
+
+
+_START = Stage(STARTING)
 
 
 @dataclass(frozen=True)
@@ -110,8 +114,8 @@ class DropWorker:
         self._renderer = DropRenderer(config.recipe, sources, config.threads, device, log)
         self._memory_limit = psutil.Process().memory_info().rss + _GROWTH_LIMIT_BYTES
 
-    def make(self, task: DropTask, commit: Callable[[FinishedImage], None]) -> DropResult:
-        """Make the images of one drop, and call ``commit`` with each as soon as it is made.
+    def make(self, task: DropTask, commit: Callable[[FinishedImage], None], report: Report = unreported) -> DropResult:
+        """Make the images of one drop, call ``commit`` with each as soon as it is made, and report what is done.
 
         Raises:
             DatasetError: an image cannot be written.
@@ -120,7 +124,7 @@ class DropWorker:
         made, failure = 0, ""
         try:
             _inject_fault(task.drop)
-            for image in self._renderer.make(task.drop, task.images):
+            for image in self._renderer.make(task.drop, task.images, report):
                 commit(image)
                 made += 1
         except (DatasetError, BlenderError):
@@ -136,7 +140,17 @@ class DropWorker:
         return DropResult(task, made, failure, outgrown=outgrown)
 
 
-def run(tasks: Iterable[DropTask], config: WorkerConfig, workers: int) -> Generator[DropResult, None, None]:
+Watch = Callable[[Sequence[Work]], None]
+"""Is called with what the workers do, whenever that changes and about once a second."""
+
+
+def unwatched(_: Sequence[Work]) -> None:
+    """Watch nothing."""
+
+
+def run(
+    tasks: Iterable[DropTask], config: WorkerConfig, workers: int, watch: Watch = unwatched
+) -> Generator[DropResult, None, None]:
     """Make drops in worker processes, and return the result of each as it ends, in no fixed order.
 
     A drop that kills its worker is tried once more in another one and then reported, one that hangs is reported at
@@ -147,7 +161,7 @@ def run(tasks: Iterable[DropTask], config: WorkerConfig, workers: int) -> Genera
             made.
         BlenderError: Blender cannot be used, or workers die again and again while they start.
     """
-    pool = _LocalPool(config, workers)
+    pool = _LocalPool(config, workers, watch)
     try:
         yield from pool.work(tasks)
         pool.stop(_END_LIMIT_S)
@@ -165,6 +179,7 @@ class _Worker:
         since: when it began what it does now.
         ready: whether it has started.
         task: what it does; None while it starts, and between two tasks.
+        stage: of this task, or its start.
     """
 
     process: SpawnProcess
@@ -173,6 +188,11 @@ class _Worker:
     since: float
     ready: bool = False
     task: DropTask | None = None
+    stage: Stage = _START
+
+    @property
+    def work(self) -> Work:
+        return Work(self.stage, len(self.task.images) if self.task else 0)
 
     def stop(self, grace_s: float) -> None:
         """End the process: by itself, if it does so within a time."""
@@ -193,8 +213,9 @@ class _Worker:
 class _LocalPool:
     """The workers of this machine."""
 
-    def __init__(self, config: WorkerConfig, workers: int) -> None:
+    def __init__(self, config: WorkerConfig, workers: int, watch: Watch) -> None:
         self._config = config
+        self._watch = watch
         self._most = workers
         self._workers: list[_Worker] = []
         self._waiting: deque[DropTask] = deque()
@@ -214,6 +235,7 @@ class _LocalPool:
                 self._start_worker()
             for worker in [worker for worker in self._workers if worker.ready and worker.task is None]:
                 self._hand_out(worker)
+            self._watch([each.work for each in self._workers if each.task or not each.ready])
             answered = connection.wait([worker.pipe for worker in self._workers], timeout=_TICK_S)
             for worker in [worker for worker in self._workers if worker.pipe in answered]:
                 result = self._receive(worker)
@@ -257,7 +279,7 @@ class _LocalPool:
         except OSError:  # it has died since; that is no fault of this task
             self._remove(worker)
         else:
-            worker.task, worker.since = self._waiting.popleft(), time.monotonic()
+            worker.task, worker.stage, worker.since = self._waiting.popleft(), Stage(COLLIDERS), time.monotonic()
 
     def _receive(self, worker: _Worker) -> DropResult | None:
         """Read what a worker sends; the result of its task, if that is known now."""
@@ -268,6 +290,9 @@ class _LocalPool:
         if isinstance(answer, Exception):
             raise answer
         self._deaths_at_start = 0
+        if isinstance(answer, Stage):
+            worker.stage = answer
+            return None
         if not isinstance(answer, DropResult):
             worker.ready = True
             return None
@@ -322,7 +347,7 @@ def _serve(pipe: Connection, config: WorkerConfig, log: Path) -> None:
             commit = DatasetStore(config.root, config.recipe).commit
             pipe.send(None)  # started
             while True:
-                pipe.send(worker.make(pipe.recv(), commit))
+                pipe.send(worker.make(pipe.recv(), commit, pipe.send))
         except (UserError, BlenderError) as error:
             pipe.send(error)
 

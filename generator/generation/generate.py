@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Generator, Iterable
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-
-from tqdm import tqdm
 
 from synthetless.config import Recipe
 from synthetless.dataset import records
@@ -23,6 +20,7 @@ from synthetless.generation import executors, ray_executor
 from synthetless.generation.devices import CPU, Devices
 from synthetless.generation.drop import DropRenderer
 from synthetless.generation.executors import DropResult, DropTask, WorkerConfig
+from synthetless.generation.progress import DONE, FINISHING, READING, Tell, Tracker, silent
 from synthetless.generation.sources import Sources, check_photos, load_sources
 from synthetless.io.files import in_turn, locked, remove_file, write_json
 from synthetless.io.parallel import usable_cores
@@ -80,21 +78,24 @@ class Execution:
         return self.workers or of_machine
 
 
-def generate(recipe: Recipe, out: Path, execution: Execution) -> Summary:
+def generate(recipe: Recipe, out: Path, execution: Execution, tell: Tell = silent) -> Summary:
     """Make the images that the dataset in ``out`` lacks; an interrupted run is continued.
 
     Args:
         recipe: what to make.
         out: the dataset's folder.
         execution: how.
+        tell: is called with where it stands.
 
     Raises:
         UserError: the recipe's sources or the folder cannot be used, or a file cannot be written.
         BlenderError: Blender cannot be used.
     """
+    tracker = Tracker(tell)
+    tracker.phase(READING)
     sources = load_sources(recipe)
     if not (out / DATASET_FILE).exists():
-        check_photos(sources)
+        check_photos(sources, tracker)
         make_folder(out)
     with locked(out, execution.part.name if execution.part else None):
         with in_turn(out):  # parts that begin at the same moment must be parts of one recipe
@@ -103,15 +104,17 @@ def generate(recipe: Recipe, out: Path, execution: Execution) -> Summary:
         failures = list[DropResult]()
         try:
             if missing:
-                failures = _make(dataset, sources, missing, execution)
+                failures = _make(dataset, sources, missing, execution, tracker)
         except BaseException:
             with suppress(UserError):  # an interrupted dataset can be looked at, too; the first error is told
                 dataset.assemble()
             raise
+        tracker.phase(FINISHING)
         dataset.finish()
         summary = _summarise(dataset, len(missing) - len(wanted(dataset, execution.part)), failures)
         if summary.images:
             _draw_sheet(dataset)
+    tracker.phase(DONE)
     return summary
 
 
@@ -153,38 +156,40 @@ def retry(out: Path, drop: int, textures: str | None = None) -> int:
     return len(plans)
 
 
-def _make(dataset: DatasetStore, sources: Sources, missing: list[int], execution: Execution) -> list[DropResult]:
+def _make(
+    dataset: DatasetStore, sources: Sources, missing: list[int], execution: Execution, tracker: Tracker
+) -> list[DropResult]:
     """Make the missing images; return the drops that failed, in their order."""
     failures: list[DropResult] = []
     views = dataset.recipe.camera.views_per_drop
     tasks = (DropTask(drop, tuple(images)) for drop, images in by_drop(missing, views))
-    interval = 0.5 if sys.stderr.isatty() else 60.0
     next_sheet: float = 1 if execution.preview_every else math.inf
-    bar = tqdm(total=len(missing), unit="image", mininterval=interval, maxinterval=interval, smoothing=0.05)
-    with bar, closing(_results(dataset, tasks, execution)) as results:  # closed: no worker continues after an error
+    made = 0
+    tracker.want(len(missing))
+    with closing(_results(dataset, tasks, execution, tracker)) as results:  # closed: no worker continues after an error
         assembled = time.monotonic()
         for result in results:
-            bar.update(result.made)
+            made += result.made
+            tracker.ended(len(result.task.images), result.made, bool(result.failure))
             _note_failure(dataset, sources, result)
             if result.failure:
                 failures.append(result)
-                bar.set_postfix(failed=len(failures))
-            if bar.n >= next_sheet or time.monotonic() - assembled > _BETWEEN_ASSEMBLIES_S:
+            if made >= next_sheet or time.monotonic() - assembled > _BETWEEN_ASSEMBLIES_S:
                 dataset.assemble()
                 assembled = time.monotonic()
-            if bar.n >= next_sheet:
+            if made >= next_sheet:
                 _draw_sheet(dataset)
-                next_sheet = bar.n + execution.preview_every
+                next_sheet = made + execution.preview_every
     return sorted(failures, key=lambda result: result.task.drop)
 
 
 def _results(
-    dataset: DatasetStore, tasks: Iterable[DropTask], execution: Execution
+    dataset: DatasetStore, tasks: Iterable[DropTask], execution: Execution, tracker: Tracker
 ) -> Generator[DropResult, None, None]:
     config = WorkerConfig(dataset.recipe, dataset.root, execution.threads, execution.drop_limit_s, execution.devices)
     if execution.cluster is not None:
-        return ray_executor.run(tasks, config, execution.cluster, execution.workers)
-    return executors.run(tasks, config, execution.processes)
+        return ray_executor.run(tasks, config, execution.cluster, execution.workers, tracker.watch)
+    return executors.run(tasks, config, execution.processes, tracker.watch)
 
 
 def _draw_sheet(dataset: DatasetStore) -> None:

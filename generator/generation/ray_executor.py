@@ -25,7 +25,16 @@ from synthetless.dataset.layout import LOGS_FOLDER
 from synthetless.dataset.store import DatasetStore, FinishedImage, versions
 from synthetless.errors import UserError
 from synthetless.generation.devices import CPU, ask, take_assigned
-from synthetless.generation.executors import FAULT_VARIABLE, DropResult, DropTask, DropWorker, WorkerConfig
+from synthetless.generation.executors import (
+    FAULT_VARIABLE,
+    DropResult,
+    DropTask,
+    DropWorker,
+    Watch,
+    WorkerConfig,
+    unwatched,
+)
+from synthetless.generation.progress import RENDERING, STARTING, Stage, Work
 from synthetless.generation.sources import Sources, load_sources
 from synthetless.io.cache import CACHE_VARIABLE
 from synthetless.io.files import atomic_write, user_folder
@@ -62,7 +71,11 @@ _log = logging.getLogger(__name__)
 
 
 def run(
-    tasks: Iterable[DropTask], config: WorkerConfig, address: str | None = None, workers: int | None = None
+    tasks: Iterable[DropTask],
+    config: WorkerConfig,
+    address: str | None = None,
+    workers: int | None = None,
+    watch: Watch = unwatched,
 ) -> Generator[DropResult, None, None]:
     """Make drops on a Ray cluster, and return the result of each as it ends, in no fixed order.
 
@@ -75,6 +88,7 @@ def run(
         config: what a worker needs to know; it takes ``threads`` cores of a node, or a core and a GPU.
         address: of the cluster, as Ray writes it; None for the one that RAY_ADDRESS names or that runs here.
         workers: how many; None for as many as the cluster has room for, also when nodes join or leave.
+        watch: is told how many workers there are; what each of them does only its own machine knows.
 
     Raises:
         UserError: Ray is not installed, the cluster cannot be reached or has no room for a worker, a node, which is
@@ -89,7 +103,7 @@ def run(
     with connected(address or "auto") as ray:
         atomic_write(token, b"")
         try:
-            yield from _RayPool(ray, config, sources, token, workers).work(tasks)
+            yield from _RayPool(ray, config, sources, token, workers, watch).work(tasks)
         finally:
             with suppress(OSError):
                 token.unlink()
@@ -221,12 +235,19 @@ class _Call:
     since: float
     nodes: frozenset[str]
 
+    @property
+    def work(self) -> Work:
+        return Work(Stage(RENDERING), len(self.task.images)) if self.task else Work(Stage(STARTING))
+
 
 class _RayPool:
     """The workers of a cluster; for each of them exactly one call is under way."""
 
-    def __init__(self, ray: Any, config: WorkerConfig, sources: Sources, token: Path, workers: int | None) -> None:
+    def __init__(
+        self, ray: Any, config: WorkerConfig, sources: Sources, token: Path, workers: int | None, watch: Watch
+    ) -> None:
         self._ray = ray
+        self._watch = watch
         self._sources = sources
         self._dataset = DatasetStore(config.root, config.recipe)
         self._wanted = workers
@@ -255,6 +276,7 @@ class _RayPool:
             if not self._waiting and not any(call.task for call in self._calls.values()):
                 return
             self._start_workers()
+            self._watch([call.work for call in self._calls.values()])
             for ref in self._ray.wait(list(self._calls), timeout=_TICK_S)[0]:
                 result = self._receive(ref, self._calls.pop(ref))
                 if result:

@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from tqdm import tqdm
-
 from synthetless.config import BUILTIN, Recipe, RecipeError, models_folder
 from synthetless.errors import UserError
+from synthetless.generation.progress import Tracker
 from synthetless.io.models import ObjectModel, load_models
 from synthetless.scenes.sampling import Catalogue
 from synthetless.scenes.textures import list_photos, load_photo
@@ -73,14 +72,15 @@ def load_sources(recipe: Recipe) -> Sources:
     return Sources(models, distractors, list_photos(folder), folder)
 
 
-def check_photos(sources: Sources) -> None:
+def check_photos(sources: Sources, tracker: Tracker) -> None:
     """Decode every photograph once, so that a damaged one is found before the run and not in the middle of it.
 
     Raises:
         UserError: one cannot be decoded.
     """
     if sources.photos_folder is not None:
-        for name in tqdm(sources.photos, desc="checking textures", unit="file", disable=None, leave=False):
+        for number, name in enumerate(sources.photos, start=1):
+            tracker.phase("checking textures", f"{number} of {len(sources.photos)}")
             load_photo(sources.photos_folder, name)
 
 

@@ -53,6 +53,10 @@ def _command(recipe: Path, out: Path, *options: str) -> list[str]:
 
 
 def _generate(recipe: Path, out: Path, *options: str, code: int = 0, **environment: str) -> str:
+    return _run(recipe, out, *options, code=code, **environment).stdout
+
+
+def _run(recipe: Path, out: Path, *options: str, code: int = 0, **environment: str) -> subprocess.CompletedProcess[str]:
     done = subprocess.run(
         _command(recipe, out, "--json", *options),
         cwd=ROOT,
@@ -63,7 +67,7 @@ def _generate(recipe: Path, out: Path, *options: str, code: int = 0, **environme
         check=False,
     )
     assert done.returncode == code, done.stderr
-    return done.stdout
+    return done
 
 
 @pytest.fixture(scope="session")
@@ -96,8 +100,14 @@ def test_every_file_is_there(dataset: Path) -> None:
     assert set(read_json(dataset / "camera.json")) == {"cx", "cy", "depth_scale", "fx", "fy", "height", "width"}
 
 
-def test_workers_do_not_change_a_byte(dataset: Path, recipe: Path, tmp_path: Path) -> None:
-    _generate(recipe, tmp_path / "d", "--workers", "2")
+def test_workers_do_not_change_a_byte_and_tell_what_they_do(dataset: Path, recipe: Path, tmp_path: Path) -> None:
+    done = _run(recipe, tmp_path / "d", "--workers", "2", "--json-progress")
+    told = [json.loads(line) for line in done.stderr.splitlines()]
+    phases = [each["phase"] for each in told]
+    assert phases[:3] == ["looking for devices", "reading models", "starting Blender"]
+    assert {"dropping objects", "rendering", "making images"} & set(phases)
+    assert phases[-2:] == ["writing the dataset's files", "done"]
+    assert (told[-1]["images"], told[-1]["wanted"], told[-1]["share"]) == (6, 6, 1.0)
     assert data_files(tmp_path / "d") == data_files(dataset)
 
 

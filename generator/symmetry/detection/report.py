@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -172,6 +173,19 @@ def describe(table: SymmetryTable) -> str:
         f"dangerous under pitteri2019 (margin below {DANGEROUS_DEG:g} degrees):",
     ]
     return "\n".join([aligned(rows, left=(1, 3, 4)), "", *notes, *_dangers(table), *_quasi_lines(table)])
+
+
+def described(table: SymmetryTable) -> dict[str, Any]:
+    """What ``describe`` tells, as JSON values: the table, and for each object and scheme its regressors and margin."""
+    objects = {
+        str(obj_id): {
+            "n_regressors": {scheme: entry.canonical_map(scheme).n_regressors for scheme in SCHEMES},
+            "smallest_margin_deg": {s: smallest_margin_deg(parse_name(entry.group.name), s) for s in SCHEMES},
+            "dangerous_views": dangerous_views(entry),
+        }
+        for obj_id, entry in table.entries.items()
+    }
+    return {"table": table.to_dict(), "objects": objects}
 
 
 def dangerous_views(entry: SymmetryEntry) -> str:
