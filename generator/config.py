@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
@@ -21,7 +21,7 @@ from synthetless import assets
 from synthetless.errors import UserError
 from synthetless.io.documents import parse_document, read_document, shown
 from synthetless.io.files import atomic_write
-from synthetless.scenes.settings import SENSORS, Bounds, SceneSettings, SensorSettings, Settings
+from synthetless.scenes.settings import SENSORS, Bounds, RoomSettings, SceneSettings, SensorSettings, Settings
 from synthetless.scenes.spec import Intrinsics
 
 BUILTIN = "builtin"
@@ -30,6 +30,16 @@ BUILTIN_RECIPES = Path(__file__).parent / "configs"
 Tree = TypeVar("Tree", bound=Settings)
 SPLIT = "train_synthetless"
 """The folder of scenes, if a recipe names no other."""
+
+_NAMED: Mapping[tuple[str, ...], Callable[[str], dict[str, Any]]] = {
+    ("sensor",): lambda name: {} if name == "none" else {"preset": name},
+    ("light", "room"): lambda _: {},
+}
+"""Groups of settings that may be given by name, and what a name stands for when an override changes one of them."""
+_NAMES: Mapping[type[Settings], tuple[str, ...]] = {
+    SensorSettings: ("none", *SENSORS),
+    RoomSettings: ("none", "ranges"),
+}
 
 Output = Literal["rgb", "depth", "masks", "normals", "object_coordinates", "exr"]
 
@@ -235,12 +245,11 @@ def _apply(tree: dict[str, Any], override: str) -> None:
         value = parse_document(text, shown(text))
     except UserError as error:
         raise RecipeError(f"--set {key}: {error}") from None
-    named = tree.get("sensor")
-    if path[0] == "sensor" and len(path) > 1 and (named is None or isinstance(named, str)):
-        tree["sensor"] = {} if named in (None, "none") else {"preset": named}
     node = tree
-    for name in path[:-1]:
+    for depth, name in enumerate(path[:-1], start=1):
         child = node.setdefault(name, {})
+        if tuple(path[:depth]) in _NAMED and (child is None or isinstance(child, str)):
+            child = node[name] = _NAMED[tuple(path[:depth])](child or "none")
         if not isinstance(child, dict):
             raise RecipeError(f"--set {key}: {shown(name)} is a single value, it has no settings inside")
         node = child
@@ -274,10 +283,9 @@ def _kind(annotation: Any, metadata: Sequence[Any]) -> str:
     """How the value is written: choices, range or number with its bounds and unit."""
     bounds = next((str(item) for item in metadata if isinstance(item, Bounds)), "")
     arguments = get_args(annotation)
-    if SensorSettings in arguments:
-        return " | ".join(["none", *SENSORS])
-    if arguments and all(isinstance(item, str) for item in arguments):
-        return " | ".join(arguments)
+    names = next((names for group, names in _NAMES.items() if group in arguments), arguments)
+    if names and all(isinstance(item, str) for item in names):
+        return " | ".join(names)
     if len(arguments) == 2 and arguments[0] is arguments[1] and Ellipsis not in arguments:
         return f"[min, max] in {bounds}"
     if bounds:

@@ -1,4 +1,4 @@
-"""The lamp and the light from everywhere."""
+"""The lamp, the light from everywhere, and the room around the table."""
 
 from __future__ import annotations
 
@@ -6,9 +6,13 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from synthetless.scenes.spec import AmbientLight, PointLight
+from synthetless.scenes.materials import glowing
+from synthetless.scenes.spec import AmbientLight, AreaLight, PointLight, RoomSpec, Vector
+
+_FLOOR_M = 0.75
+"""How far a room's floor lies below the table."""
 
 
 def lamp_power_w(light: PointLight) -> float:
@@ -20,20 +24,78 @@ def lamp_power_w(light: PointLight) -> float:
     return 4 * math.pi**2 * light.distance_m**2 * light.strength
 
 
+def disc_power_w(light: AreaLight) -> float:
+    """Power of a Blender disc light that gives a white matte surface at the aim point the wanted brightness.
+
+    A disc of radius r and radiance L shines with irradiance pi L r^2 / (r^2 + d^2) on a surface that faces it at
+    distance d on its axis; its power is pi^2 r^2 L.
+    """
+    return math.pi**2 * (light.radius_m**2 + light.distance_m**2) * light.strength
+
+
 def add_lamp(bpy: Any, collection: Any, light: PointLight, centre_m: ArrayLike) -> None:
     """Add the lamp to a bpy collection; ``centre_m`` (3,) is the point it is measured from."""
     data = bpy.data.lights.new("lamp", "POINT")
     data.energy = lamp_power_w(light)
     data.color = light.color
     data.shadow_soft_size = light.radius_m
-    elevation, azimuth = math.radians(light.elevation_deg), math.radians(light.azimuth_deg)
-    direction = np.array(
-        [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
-    )
     lamp = bpy.data.objects.new("lamp", data)
-    lamp.location = (np.asarray(centre_m) + light.distance_m * direction).tolist()
+    lamp.location = (np.asarray(centre_m) + light.distance_m * _direction(light)).tolist()
     lamp.visible_camera = False
     collection.objects.link(lamp)
+
+
+def add_room(bpy: Any, collection: Any, room: RoomSpec, ambient: AmbientLight, centre_m: ArrayLike) -> None:
+    """Put a room around the table.
+
+    Args:
+        bpy, collection: where to.
+        room: its walls stand round the world's origin, its lamps are measured from ``centre_m``.
+        ambient: comes from the walls, too, since they hide what is behind them.
+        centre_m: (3,) centre of the objects.
+    """
+    half, low, high = room.side_m / 2, -_FLOOR_M, room.height_m
+    x, y, z = (np.array(signs) for signs in np.meshgrid([-half, half], [-half, half], [low, high], indexing="ij"))
+    corners = np.stack([x, y, z], axis=-1)
+    east, north, west, south = corners[1], corners[:, 1], corners[0], corners[:, 0]
+    for side, radiance in zip((east, north, west, south), room.walls, strict=True):
+        _add_side(bpy, collection, side, radiance, ambient)
+    _add_side(bpy, collection, corners[:, :, 1], room.ceiling, ambient)
+    _add_side(bpy, collection, corners[:, :, 0], room.floor, ambient)
+    for light in room.lamps:
+        _add_disc(bpy, collection, light, centre_m)
+
+
+def _add_side(bpy: Any, collection: Any, corners: NDArray[np.float64], radiance: Vector, ambient: AmbientLight) -> None:
+    """Add a rectangle with these corners (2, 2, 3); it glows."""
+    mesh = bpy.data.meshes.new("side")
+    mesh.from_pydata(corners.reshape(4, 3).tolist(), [], [(0, 1, 3, 2)])
+    red, green, blue = (own + ambient.level * share for own, share in zip(radiance, ambient.color, strict=True))
+    mesh.materials.append(glowing(bpy, (red, green, blue)))
+    collection.objects.link(bpy.data.objects.new("side", mesh))
+
+
+def _add_disc(bpy: Any, collection: Any, light: AreaLight, centre_m: ArrayLike) -> None:
+    from mathutils import Vector as BlenderVector
+
+    data = bpy.data.lights.new("disc", "AREA")
+    data.shape, data.size = "DISK", 2 * light.radius_m
+    data.energy = disc_power_w(light)
+    data.color = light.color
+    disc = bpy.data.objects.new("disc", data)
+    direction = _direction(light)
+    disc.rotation_euler = BlenderVector(direction.tolist()).to_track_quat("Z", "Y").to_euler()  # it shines along -z
+    disc.location = (np.asarray(centre_m) + light.distance_m * direction).tolist()
+    disc.visible_camera = False
+    collection.objects.link(disc)
+
+
+def _direction(light: PointLight) -> NDArray[np.float64]:
+    """(3,) unit vector towards a lamp."""
+    elevation, azimuth = math.radians(light.elevation_deg), math.radians(light.azimuth_deg)
+    return np.array(
+        [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
+    )
 
 
 def add_ambient(bpy: Any, scene: Any, ambient: AmbientLight) -> None:

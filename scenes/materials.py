@@ -1,4 +1,4 @@
-"""What things are made of: grey plastic, and a textured table."""
+"""What things are made of: objects of one colour, and a textured table."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetless.scenes.spec import Material, PlaneSpec
+from synthetless.scenes.spec import Material, PlaneSpec, Vector
 
 
 def plastic(bpy: Any, material: Material) -> Any:
     """A bpy material of one colour."""
     made, nodes, links = _empty_material(bpy, "plastic")
-    shader = _surface(nodes, links, material.roughness, material.specular)
+    shader = _surface(nodes, links, material.roughness, material.specular, material.metallic)
     shader.inputs[0].default_value = (*material.albedo, 1.0)
     return made
 
@@ -70,12 +70,23 @@ def _empty_material(bpy: Any, name: str) -> tuple[Any, Any, Any]:
     return made, tree.nodes, tree.links
 
 
-def _surface(nodes: Any, links: Any, roughness: float, specular: float) -> Any:
+def glowing(bpy: Any, radiance: Vector) -> Any:
+    """A bpy material that emits light, equally in all directions, and reflects none; ``radiance`` is linear RGB."""
+    made, nodes, links = _empty_material(bpy, "glowing")
+    shader = nodes.new("ShaderNodeEmission")
+    shader.inputs["Color"].default_value = (*radiance, 1.0)
+    links.new(shader.outputs[0], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
+    return made
+
+
+def _surface(nodes: Any, links: Any, roughness: float, specular: float, metallic: float = 0.0) -> Any:
     """The surface shader, colour as its first input: purely diffuse where nothing shines, since that renders faster."""
-    shader = nodes.new("ShaderNodeBsdfPrincipled" if specular > 0 else "ShaderNodeBsdfDiffuse")
-    if specular > 0:
+    shines = specular > 0 or metallic > 0
+    shader = nodes.new("ShaderNodeBsdfPrincipled" if shines else "ShaderNodeBsdfDiffuse")
+    if shines:
         shader.inputs["Roughness"].default_value = roughness
         shader.inputs["Specular IOR Level"].default_value = specular
+        shader.inputs["Metallic"].default_value = metallic
     output = nodes.new("ShaderNodeOutputMaterial")
     links.new(shader.outputs[0], output.inputs["Surface"])
     return shader

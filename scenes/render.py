@@ -76,6 +76,8 @@ class BlenderSession:
         try:
             lights.add_ambient(self.bpy, bpy_scene, spec.ambient)
             lights.add_lamp(self.bpy, collection, spec.light, centre_m)
+            if spec.room is not None:
+                lights.add_room(self.bpy, collection, spec.room, spec.ambient, centre_m)
             self._add_table(collection, spec, centre_m)
             for number, (item, pose) in enumerate(zip(spec.objects, settled, strict=True)):
                 placed = self.bpy.data.objects.new(f"object {number}", self._mesh(item.role, item.obj_id))

@@ -20,20 +20,24 @@ from synthetless.scenes.settings import (
     LightSettings,
     ObjectSettings,
     ReleaseSettings,
+    RoomSettings,
     SceneSettings,
     SensorSettings,
     TableSettings,
 )
 from synthetless.scenes.spec import (
     AmbientLight,
+    AreaLight,
     Material,
     ObjectSpec,
     PlaneSpec,
     PointLight,
     Pose,
     Role,
+    RoomSpec,
     SceneSpec,
     SensorSpec,
+    Vector,
     View,
 )
 from synthetless.scenes.srgb import linear_from_srgb
@@ -53,6 +57,8 @@ class Stream(IntEnum):
     LIGHT = 4
     VIEWS = 5
     SENSOR = 6
+    METALLIC = 7
+    ROOM = 8
 
 
 @dataclass(frozen=True)
@@ -88,11 +94,11 @@ def sample_scene(settings: SceneSettings, catalogue: Catalogue, seed: int, drop:
         return _stream(seed, drop, purpose, *further)
 
     chosen = _choose_objects(settings.objects, catalogue, stream(Stream.OBJECTS))
-    materials = stream(Stream.MATERIALS)
+    materials, metallic = stream(Stream.MATERIALS), stream(Stream.METALLIC)
     diameters = [(catalogue.models if role == "model" else catalogue.distractors)[i] for role, i in chosen]
     releases = _release(settings.release, diameters, stream(Stream.RELEASE, attempt))
     objects = tuple(
-        ObjectSpec(role, obj_id, _material(settings.objects, materials), pose)
+        ObjectSpec(role, obj_id, _material(settings.objects, materials, metallic), pose)
         for (role, obj_id), pose in zip(chosen, releases, strict=True)
     )
     light, ambient = _lights(settings.light, stream(Stream.LIGHT))
@@ -100,7 +106,32 @@ def sample_scene(settings: SceneSettings, catalogue: Catalogue, seed: int, drop:
         _view(settings.camera, stream(Stream.VIEWS, number)) for number in range(settings.camera.views_per_drop)
     )
     plane = _plane(settings.table, catalogue.photos, stream(Stream.PLANE))
-    return SceneSpec(drop, attempt, objects, plane, light, ambient, views)
+    room = sample_room(settings.light.room, seed, drop)
+    return SceneSpec(drop, attempt, objects, plane, light, ambient, views, room)
+
+
+def sample_room(settings: RoomSettings | None, seed: int, drop: int) -> RoomSpec | None:
+    """Draw the room of one drop; None without settings. Arguments as for ``sample_scene``."""
+    if settings is None:
+        return None
+    rng = _stream(seed, drop, Stream.ROOM)
+    side_m, height_m = _uniform(rng, settings.side_m), _uniform(rng, settings.height_m)
+    level = _uniform(rng, settings.ceiling) / ceiling_share(side_m, height_m)
+    ceiling = _tinted(level, settings.tint, rng)
+    east, north, west, south, floor = (_tinted(_uniform(rng, settings.walls), settings.tint, rng) for _ in range(5))
+    lamps = tuple(_area_light(settings, rng) for _ in range(rng.integers(*settings.lamps, endpoint=True)))
+    return RoomSpec(side_m, height_m, ceiling, floor, (east, north, west, south), lamps)
+
+
+def ceiling_share(side_m: float, height_m: float) -> float:
+    """Share of a square ceiling in the light, equal from everywhere, that reaches the table's middle, facing up.
+
+    Four times the view factor of a rectangle from a point below its corner (Howell, A catalog of radiation heat
+    transfer configuration factors, B-4).
+    """
+    ratio = side_m / 2 / height_m
+    slope = ratio / math.sqrt(1 + ratio * ratio)
+    return 4 / math.pi * slope * math.atan(slope)
 
 
 def sample_sensor(settings: SensorSettings, seed: int, drop: int, view: int) -> SensorSpec:
@@ -154,11 +185,13 @@ def _choose_objects(settings: ObjectSettings, catalogue: Catalogue, rng: np.rand
     return [chosen[i] for i in rng.permutation(len(chosen))]
 
 
-def _material(settings: ObjectSettings, rng: np.random.Generator) -> Material:
+def _material(settings: ObjectSettings, rng: np.random.Generator, metallic: np.random.Generator) -> Material:
     grey = _uniform(rng, settings.grey)
     deviations = rng.uniform(-settings.tint, settings.tint, size=3)
-    red, green, blue = (linear_from_srgb(min(max(grey + d, 0.0), 1.0)) for d in deviations.tolist())
-    return Material((red, green, blue), _uniform(rng, settings.roughness), _uniform(rng, settings.specular))
+    channels = (min(max(grey + d, 0.0), 1.0) for d in deviations.tolist())
+    red, green, blue = channels if settings.grey_scale == "linear" else map(linear_from_srgb, channels)
+    roughness, specular = _uniform(rng, settings.roughness), _uniform(rng, settings.specular)
+    return Material((red, green, blue), roughness, specular, _uniform(metallic, settings.metallic))
 
 
 def _release(settings: ReleaseSettings, diameters_m: Sequence[float], rng: np.random.Generator) -> list[Pose]:
@@ -197,9 +230,29 @@ def _lights(settings: LightSettings, rng: np.random.Generator) -> tuple[PointLig
         distance_m=_uniform(rng, settings.distance_m),
         strength=_uniform(rng, settings.strength),
         radius_m=_uniform(rng, settings.radius_m),
-        color=(1.0, 1 + warmth * (_CANDLE[1] - 1), 1 + warmth * (_CANDLE[2] - 1)),
+        color=_warm(warmth),
     )
     return light, AmbientLight(_uniform(rng, settings.ambient), (1.0, 1.0, 1.0))
+
+
+def _area_light(settings: RoomSettings, rng: np.random.Generator) -> AreaLight:
+    return AreaLight(
+        azimuth_deg=_uniform(rng, settings.lamp_azimuth_deg),
+        elevation_deg=_uniform(rng, settings.lamp_elevation_deg),
+        distance_m=_uniform(rng, settings.lamp_distance_m),
+        strength=_uniform(rng, settings.lamp_strength),
+        radius_m=_uniform(rng, settings.lamp_radius_m),
+        color=_warm(_uniform(rng, settings.lamp_warmth)),
+    )
+
+
+def _warm(warmth: float) -> Vector:
+    return (1.0, 1 + warmth * (_CANDLE[1] - 1), 1 + warmth * (_CANDLE[2] - 1))
+
+
+def _tinted(level: float, tint: float, rng: np.random.Generator) -> Vector:
+    red, green, blue = (level * (1 + rng.uniform(-tint, tint, size=3))).tolist()
+    return (red, green, blue)
 
 
 def _view(settings: CameraSettings, rng: np.random.Generator) -> View:

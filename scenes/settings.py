@@ -59,14 +59,18 @@ class ObjectSettings(Settings):
     """Labelled objects per scene, drawn with replacement."""
     ids: tuple[int, ...] | None = None
     """Object ids to draw from; null takes every model of the folder."""
-    grey: Annotated[FloatRange, Bounds(0, 1, "sRGB")] = (0.12, 0.92)
-    """Grey of each object, as displayed: 0 black, 1 white."""
+    grey: Annotated[FloatRange, Bounds(0, 1)] = (0.12, 0.92)
+    """Grey of each object: 0 black, 1 white."""
+    grey_scale: Literal["displayed", "linear"] = "displayed"
+    """What grey and tint are measured in: values as displayed, or linear light, which gives lighter objects."""
     tint: Annotated[float, Bounds(0, 1)] = 0.0
-    """Largest deviation of a colour channel from the grey, as displayed; 0 keeps objects grey."""
+    """Largest deviation of a colour channel from the grey; 0 keeps objects grey."""
     roughness: Annotated[FloatRange, Bounds(0, 1)] = (0.3, 0.9)
     """Surface roughness: 0 mirror-like, 1 matte."""
     specular: Annotated[FloatRange, Bounds(0, 1)] = (0.0, 0.5)
     """Specular level: 0 none, 0.5 ordinary plastic."""
+    metallic: Annotated[FloatRange, Bounds(0, 1)] = (0.0, 0.0)
+    """How much of a metal the surface is, which reflects in its own colour: 0 plastic, 1 metal."""
     distractors: Annotated[IntRange, Bounds(0, 100, "objects")] = (0, 0)
     """Unlabelled objects per scene from the distractors folder; they are rendered and occlude."""
 
@@ -111,8 +115,45 @@ class CameraSettings(Settings):
     """Images taken of one drop from different viewpoints."""
 
 
+class RoomSettings(Settings):
+    """A room around the table: a glowing ceiling, coloured walls, and soft lamps."""
+
+    side_m: Annotated[FloatRange, Bounds(0.5, 1000, "m")] = (6.0, 10.0)
+    """Side of its square floor plan; at least that of the table."""
+    height_m: Annotated[FloatRange, Bounds(0.2, 1000, "m")] = (2.6, 4.0)
+    """Height of the ceiling above the table; lamps and cameras must fit below it."""
+    ceiling: Annotated[FloatRange, Bounds(0, 100)] = (0.1, 0.5)
+    """Linear brightness of a white matte surface on the table under the ceiling alone."""
+    walls: Annotated[FloatRange, Bounds(0, 100)] = (0.05, 0.4)
+    """Linear brightness of each wall as it is seen, and of the floor below the table."""
+    tint: Annotated[float, Bounds(0, 1)] = 0.3
+    """Largest relative deviation of a colour channel of ceiling, walls and floor."""
+    lamps: Annotated[IntRange, Bounds(0, 20, "lamps")] = (1, 3)
+    """Soft lamps, discs that face the point aimed at, beside the one above."""
+    lamp_azimuth_deg: Annotated[FloatRange, Bounds(-360, 360, "deg")] = (0.0, 360.0)
+    """Direction of each of them around the table."""
+    lamp_elevation_deg: Annotated[FloatRange, Bounds(1, 90, "deg")] = (30.0, 85.0)
+    """Height of each of them above the table."""
+    lamp_distance_m: Annotated[FloatRange, Bounds(0.1, 100, "m")] = (1.0, 2.2)
+    """Distance of each of them from the point aimed at."""
+    lamp_radius_m: Annotated[FloatRange, Bounds(0.001, 10, "m")] = (0.1, 0.4)
+    """Radius of each disc."""
+    lamp_strength: Annotated[FloatRange, Bounds(0, 100)] = (0.1, 0.5)
+    """Linear brightness of a white matte surface that faces one of them."""
+    lamp_warmth: Annotated[FloatRange, Bounds(0, 1)] = (0.0, 0.3)
+    """Colour of each of them: 0 white, 1 candle-light."""
+
+
+def _room_by_name(given: Any) -> Any:
+    if not isinstance(given, str):
+        return given
+    if given not in ("none", "ranges"):
+        raise PydanticCustomError("room", "unknown room; give none, ranges, or a mapping of its settings")
+    return None if given == "none" else {}
+
+
 class LightSettings(Settings):
-    """One lamp and light from everywhere."""
+    """One lamp and light from everywhere, and what stands around the table."""
 
     azimuth_deg: Annotated[FloatRange, Bounds(-360, 360, "deg")] = (0.0, 360.0)
     """Direction of the lamp around the table."""
@@ -128,6 +169,9 @@ class LightSettings(Settings):
     """Colour of the lamp: 0 white, 1 candle-light."""
     ambient: Annotated[FloatRange, Bounds(0, 100)] = (0.08, 0.5)
     """Linear brightness of a white matte surface under the ambient light alone."""
+    room: Annotated[RoomSettings | None, BeforeValidator(_room_by_name)] = None
+    """A room around the table, whose ceiling, walls and lamps give more light and are mirrored by what shines: none,
+    ranges as below, or its settings."""
 
 
 class TableSettings(Settings):

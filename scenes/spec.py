@@ -6,8 +6,8 @@ World frame: metres, right-handed, the table is the plane z = 0 and z points up.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,11 +34,19 @@ class Pose:
 
 @dataclass(frozen=True)
 class Material:
-    """A dielectric's look: linear albedo (grey or RGB), roughness and specular level, each in 0..1."""
+    """What a surface looks like.
+
+    Attributes:
+        albedo: linear, grey or RGB.
+        roughness: 0 mirror-like, 1 matte.
+        specular: level of a dielectric's reflection, 0 none, 0.5 ordinary plastic.
+        metallic: 0 a dielectric, 1 a metal.
+    """
 
     albedo: Vector
     roughness: float
     specular: float
+    metallic: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -86,6 +94,31 @@ class PointLight:
 
 
 @dataclass(frozen=True)
+class AreaLight(PointLight):
+    """A glowing disc that faces the point the camera aims at; ``radius_m`` is the disc's."""
+
+
+@dataclass(frozen=True)
+class RoomSpec:
+    """A room around the table, which stands in its middle; ceiling, walls and floor glow and do not reflect.
+
+    Attributes:
+        side_m: of its square floor plan, parallel to the table.
+        height_m: of the ceiling above the table.
+        ceiling, floor: linear radiance; a white matte surface that saw nothing else would be as bright.
+        walls: the same of the walls at +x, +y, -x and -y.
+        lamps: soft lamps.
+    """
+
+    side_m: float
+    height_m: float
+    ceiling: Vector
+    floor: Vector
+    walls: tuple[Vector, Vector, Vector, Vector]
+    lamps: tuple[AreaLight, ...]
+
+
+@dataclass(frozen=True)
 class AmbientLight:
     """Light from everywhere: ``level`` is the linear brightness of a white matte surface under it alone."""
 
@@ -123,6 +156,18 @@ class SceneSpec:
     light: PointLight
     ambient: AmbientLight
     views: tuple[View, ...]
+    room: RoomSpec | None = None
+
+
+def plain(spec: Any) -> Any:
+    """A description as JSON data, without the fields that are at their defaults.
+
+    So the record of a scene does not change when the description learns of something that the scene does not have.
+    """
+    if is_dataclass(spec):
+        values = ((field, getattr(spec, field.name)) for field in fields(spec))
+        return {f.name: plain(value) for f, value in values if f.default is MISSING or value != f.default}
+    return [plain(item) for item in spec] if isinstance(spec, tuple) else spec
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,8 @@ def test_every_setting_is_described_with_its_range() -> None:
 @given(st.sampled_from([s.key for s in settings()]))
 def test_every_default_survives_being_set(key: str) -> None:
     default = next(setting.default for setting in settings() if setting.key == key)
-    expected = load_recipe(None, ["sensor=ranges"]) if key.startswith("sensor.") else Recipe()
+    group = next((name for name in ("sensor", "light.room") if key.startswith(f"{name}.")), None)
+    expected = load_recipe(None, [f"{group}=ranges"]) if group else Recipe()
     assert load_recipe(None, [f"{key}={json.dumps(default)}"]) == expected
 
 

@@ -8,7 +8,7 @@ https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, NotRequired
@@ -23,7 +23,7 @@ from synthetless.annotation.instances import InstanceAnnotation
 from synthetless.errors import UserError
 from synthetless.io.documents import shown
 from synthetless.io.files import read_json, write_json
-from synthetless.scenes.spec import Intrinsics, Pose, SceneSpec, SensorSpec
+from synthetless.scenes.spec import Intrinsics, Pose, SceneSpec, SensorSpec, plain
 
 MIN_VISIB_FRACT = 0.1
 """Instances with a smaller visible fraction are marked ``ignore`` in scene_gt_coco.json, as bop_toolkit does."""
@@ -304,9 +304,7 @@ def _schema_fault(fault: ErrorDetails) -> SchemaFault:
 
 def spec_entry(spec: ImageSpec) -> dict[str, Any]:
     """An image's line in scene_spec.jsonl."""
-    entry = asdict(spec)
-    if spec.sensor is None:
-        del entry["sensor"]
+    entry: dict[str, Any] = plain(spec)
     return entry
 
 

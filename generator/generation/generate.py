@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Generator, Iterable
 from contextlib import closing, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from synthetless.config import Recipe
@@ -25,6 +25,7 @@ from synthetless.generation.sources import Sources, check_photos, load_sources
 from synthetless.io.files import in_turn, locked, remove_file, write_json
 from synthetless.io.parallel import usable_cores
 from synthetless.scenes.sampling import sample_scene
+from synthetless.scenes.spec import plain
 
 _BETWEEN_ASSEMBLIES_S = 60.0
 
@@ -204,7 +205,7 @@ def _note_failure(dataset: DatasetStore, sources: Sources, result: DropResult) -
     path = _failure_note(dataset.root, drop)
     if result.failure:
         scene = sample_scene(recipe, sources.catalogue, recipe.seed, drop)
-        write_json(path, {"drop": drop, "failure": result.failure, "scene": asdict(scene)})
+        write_json(path, {"drop": drop, "failure": result.failure, "scene": plain(scene)})
     else:
         remove_file(path)
 

@@ -15,6 +15,9 @@ from synthetless.scenes.sampling import Catalogue
 from synthetless.scenes.textures import list_photos, load_photo
 from synthetless.symmetry import SymmetryGroup
 
+_BESIDE_CENTRE_M = 0.1
+"""The objects' centre, which lamps and cameras are measured from, is about this far from the middle of the table."""
+
 
 @dataclass(frozen=True)
 class Sources:
@@ -56,6 +59,7 @@ def load_sources(recipe: Recipe) -> Sources:
     Raises:
         UserError: one of them is missing or cannot be used.
     """
+    _check_room(recipe)
     models = load_models(models_folder(recipe.source.models), recipe.objects.ids)
     for obj_id, model in models.items():
         _check_symmetries(obj_id, model)
@@ -70,6 +74,28 @@ def load_sources(recipe: Recipe) -> Sources:
         return Sources(models, distractors, (), None)
     folder = Path(recipe.source.textures)
     return Sources(models, distractors, list_photos(folder), folder)
+
+
+def _check_room(recipe: Recipe) -> None:
+    """What is outside the room would be hidden by its walls."""
+    room = recipe.light.room
+    if room is None:
+        return
+    if room.side_m[0] < recipe.table.size_m:
+        raise RecipeError(
+            f"light.room.side_m = {list(room.side_m)}: the table, {recipe.table.size_m:g} m wide, must fit in the room"
+        )
+    inside_m = min(room.height_m[0], room.side_m[0] / 2) - _BESIDE_CENTRE_M
+    for key, farthest_m in (
+        ("camera.distance_m", recipe.camera.distance_m[1]),
+        ("light.distance_m", recipe.light.distance_m[1] if recipe.light.strength[1] > 0 else 0.0),
+        ("light.room.lamp_distance_m", room.lamp_distance_m[1] if room.lamps[1] > 0 else 0.0),
+    ):
+        if farthest_m > inside_m:
+            raise RecipeError(
+                f"{key} reaches {farthest_m:g} m; with light.room.height_m = {list(room.height_m)} and side_m = "
+                f"{list(room.side_m)}, what is farther than {inside_m:g} m may be outside the room"
+            )
 
 
 def check_photos(sources: Sources, tracker: Tracker) -> None:

@@ -13,7 +13,8 @@ from scipy import stats
 
 from synthetless.config import BUILTIN, Recipe
 from synthetless.scenes.sampling import lamp_warmth
-from synthetless.scenes.spec import ObjectSpec, SceneSpec, View
+from synthetless.scenes.settings import RoomSettings
+from synthetless.scenes.spec import ObjectSpec, RoomSpec, SceneSpec, View
 from synthetless.scenes.srgb import srgb_from_linear
 from synthetless.scenes.textures import FAMILIES, PhotoTexture
 
@@ -29,6 +30,7 @@ FEWEST_VALUES = 20
 _FEWEST_EXPECTED = 5.0  # in each category, for the chi-squared approximation to hold
 _BINS = 24
 _ROUNDING = 1e-9
+_SCALES = {"displayed": "as displayed", "linear": "linear"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,11 +140,15 @@ def _objects(seen: Observations, recipe: Recipe) -> Iterator[Distribution]:
     yield _categories("objects_per_drop", "objects", "Objects dropped", named, weights, f"each of {low} to {high}")
     yield _release(items)
     if recipe.objects.tint == 0:
-        grey = srgb_from_linear(np.array([item.material.albedo[0] for item in items]))
-        yield _uniform("grey", "objects", "Grey, as displayed", grey, recipe.objects.grey)
+        linear = np.array([item.material.albedo[0] for item in items])
+        grey = linear if recipe.objects.grey_scale == "linear" else srgb_from_linear(linear)
+        yield _uniform("grey", "objects", f"Grey, {_SCALES[recipe.objects.grey_scale]}", grey, recipe.objects.grey)
     for name, bounds in (("roughness", recipe.objects.roughness), ("specular", recipe.objects.specular)):
         values = np.array([getattr(item.material, name) for item in items])
         yield _uniform(f"object_{name}", "objects", f"{name.capitalize()} of the objects", values, bounds)
+    if recipe.objects.metallic != (0, 0):
+        metallic = np.array([item.material.metallic for item in items])
+        yield _uniform("object_metallic", "objects", "Metallic share of the objects", metallic, recipe.objects.metallic)
 
 
 def _release(items: Sequence[ObjectSpec]) -> Distribution:
@@ -182,6 +188,30 @@ def _light(seen: Observations, recipe: Recipe) -> Iterator[Distribution]:
     yield _uniform("light_warmth", "light", "Warmth of the lamp", warmth, asked.warmth)
     ambient = np.array([spec.ambient.level for spec in seen.drops])
     yield _uniform("ambient", "light", "Ambient level", ambient, asked.ambient)
+    if asked.room is not None:
+        yield from _room([spec.room for spec in seen.drops if spec.room is not None], asked.room)
+
+
+def _room(rooms: Sequence[RoomSpec], asked: RoomSettings) -> Iterator[Distribution]:
+    for name, title, bounds in (
+        ("side_m", "Side of the room, m", asked.side_m),
+        ("height_m", "Height of the ceiling, m", asked.height_m),
+    ):
+        yield _uniform(f"room_{name}", "light", title, np.array([getattr(room, name) for room in rooms]), bounds)
+    lamps = [lamp for room in rooms for lamp in room.lamps]
+    for name, title, bounds in (
+        ("azimuth_deg", "Azimuth of the soft lamps, °", asked.lamp_azimuth_deg),
+        ("elevation_deg", "Elevation of the soft lamps, °", asked.lamp_elevation_deg),
+        ("distance_m", "Distance of the soft lamps, m", asked.lamp_distance_m),
+        ("strength", "Strength of the soft lamps", asked.lamp_strength),
+        ("radius_m", "Radius of the soft lamps, m", asked.lamp_radius_m),
+    ):
+        yield _uniform(f"soft_{name}", "light", title, np.array([getattr(lamp, name) for lamp in lamps]), bounds)
+    low, high = asked.lamps
+    found = Counter(len(room.lamps) for room in rooms)
+    sizes = range(min(low, *found), max(high, *found) + 1)
+    named, weights = {str(n): found[n] for n in sizes}, {str(n): float(low <= n <= high) for n in sizes}
+    yield _categories("soft_lamps", "light", "Soft lamps of a room", named, weights, f"each of {low} to {high}")
 
 
 def _table(seen: Observations, recipe: Recipe) -> Iterator[Distribution]:

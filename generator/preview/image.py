@@ -22,7 +22,7 @@ from synthetless.dataset.records import ImageSpec, ModelInfo
 from synthetless.errors import UserError
 from synthetless.io import images
 from synthetless.io.files import atomic_write, read_bytes
-from synthetless.scenes.spec import Material, PlaneSpec, SensorSpec, Vector, View
+from synthetless.scenes.spec import Material, PlaneSpec, RoomSpec, SensorSpec, Vector, View
 from synthetless.scenes.srgb import srgb_from_linear
 from synthetless.scenes.textures import PhotoTexture
 
@@ -264,6 +264,7 @@ def _sections(K: Floats, recorded: ImageSpec | None) -> list[Section]:
                 ["exposure gain", f"{recorded.exposure_gain:.2f}"],
             ],
         },
+        *([] if spec.room is None else [{"title": "Room", "rows": _room_rows(spec.room)}]),
         {"title": "Table", "rows": _plane_rows(spec.plane)},
         {
             "title": "Drop",
@@ -298,6 +299,18 @@ def _plane_rows(plane: PlaneSpec) -> list[list[str]]:
     ]
 
 
+def _room_rows(room: RoomSpec) -> list[list[str]]:
+    sides = [("ceiling", room.ceiling), *((f"wall {k}", wall) for k, wall in enumerate(room.walls, start=1))]
+    return [
+        ["size", f"{room.side_m:.2f} m, {room.height_m:.2f} m high"],
+        *([name, " ".join(f"{channel:.2f}" for channel in radiance), _hex(radiance)] for name, radiance in sides),
+        *(
+            [f"soft lamp {k}", f"strength {lamp.strength:.2f}, radius {lamp.radius_m:.2f} m", _hex(lamp.color)]
+            for k, lamp in enumerate(room.lamps, start=1)
+        ),
+    ]
+
+
 def _sensor_rows(sensor: SensorSpec) -> list[list[str]]:
     return [
         ["point spread", f"{sensor.blur_px:.2f} px"],
@@ -319,7 +332,8 @@ def _material(recorded: ImageSpec | None, gt_id: int) -> list[str]:
         return []
     made_of: Material = recorded.scene.objects[recorded.instances[gt_id]].material
     colour = _hex(made_of.albedo)
-    return [f"{colour}, roughness {made_of.roughness:.2f}, specular {made_of.specular:.2f}", colour]
+    words = f"{colour}, roughness {made_of.roughness:.2f}, specular {made_of.specular:.2f}"
+    return [words + (f", metallic {made_of.metallic:.2f}" if made_of.metallic else ""), colour]
 
 
 def _hex(linear: Vector) -> str:

@@ -43,6 +43,7 @@ from synthetless.io.images import (
 )
 from synthetless.io.models import load_models
 from synthetless.scenes.camera import extrinsics, settled_centre
+from synthetless.scenes.sampling import sample_room
 from synthetless.symmetry import SymmetryTable
 from synthetless.validation.images import (
     EXACT,
@@ -88,6 +89,8 @@ def check_specs(source: Source, scene: SceneRecords, plans: Sequence[ImagePlan])
             yield Finding("spec", path, f"{shown}; this image is of drop {plan.drop}, view {plan.view}", im_id)
         if plan is not None and spec.sensor != planned_sensor(source.recipe, plan):
             yield Finding("spec", path, "records another sensor than the recipe draws for this image", im_id)
+        if spec.scene.room != sample_room(source.recipe.light.room, source.recipe.seed, spec.scene.drop):
+            yield Finding("spec", path, "records another room than the recipe draws for this drop", im_id)
         fault = incoherence(spec)
         if fault:
             yield Finding("spec", path, fault, im_id)
