@@ -62,11 +62,6 @@ class Rays:
         y = (np.arange(window.top, window.bottom) - camera.cy) / camera.fy
         return cls(window, x, y)
 
-    def every(self, step: int) -> Rays:
-        """Every step-th of them in both directions, as those of a smaller window."""
-        x, y = self.x[::step], self.y[::step]
-        return Rays(Window(0, 0, len(x), len(y)), x, y)
-
     @property
     def lengths(self) -> NDArray[np.float64]:
         """(h, w) distance from the camera to z = 1 along each ray."""
@@ -148,6 +143,11 @@ class PosedSurface:
         R = np.asarray(R_m2c, dtype=np.float64)
         return cls(surface, R, R @ surface.center_mm + np.asarray(t_m2c, dtype=np.float64))
 
+    @property
+    def nearest_mm(self) -> float:
+        """No point of the mesh has a smaller z."""
+        return float(self._to_camera(self.surface.hull_mm)[:, 2].min())
+
     def window(self, camera: Intrinsics) -> Window:
         """A window that holds every pixel that can show the mesh; may leave the image, empty if it is behind."""
         points = self._to_camera(self.surface.hull_mm)
@@ -165,12 +165,34 @@ class PosedSurface:
         """(h, w) the first triangle each ray meets, or MISS."""
         if 0 in rays.window.shape:
             return np.full(rays.window.shape, MISS, dtype=np.int32)
-        # Starting just before the mesh instead of at the camera keeps the single-precision distances short.
-        start = max(NEAR_CLIP_MM, float(self._to_camera(self.surface.hull_mm)[:, 2].min()) - _START_MARGIN_MM)
-        directions = rays.in_model_frame(self.R_m2c).reshape(-1, 3)
-        origins = start * directions - self.t_center @ self.R_m2c
-        found: NDArray[np.int32] = self.surface.scene.run(origins.astype(np.float32), directions.astype(np.float32))
+        origins, directions = self._in_tree(rays.in_model_frame(self.R_m2c).reshape(-1, 3))
+        found: NDArray[np.int32] = self.surface.scene.run(origins, directions)
         return found.reshape(rays.window.shape)
+
+    def first_hits(self, directions: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+        """The first triangles that single rays meet, or MISS, and z there, or inf.
+
+        z is Embree's, in single precision: 1e-3 mm where the plane is not seen edge-on. ``depth_mm`` is exact, and
+        takes half as long again.
+
+        Args:
+            directions: (N, 3) camera frame, z = 1.
+        """
+        if len(directions) == 0:
+            return np.full(0, MISS, dtype=np.int32), np.zeros(0)
+        found = self.surface.scene.run(*self._in_tree(directions @ self.R_m2c), output=True)
+        z = np.where(found["primID"] == MISS, np.inf, self._start_mm + found["tfar"].astype(np.float64))
+        return found["primID"], z
+
+    @property
+    def _start_mm(self) -> float:
+        """z at which rays start: just before the mesh, which keeps the single-precision distances short."""
+        return max(NEAR_CLIP_MM, self.nearest_mm - _START_MARGIN_MM)
+
+    def _in_tree(self, directions: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Origins and directions (N, 3) for Embree of rays from the camera, model frame."""
+        origins = self._start_mm * directions - self.t_center @ self.R_m2c
+        return origins.astype(np.float32), directions.astype(np.float32)
 
     def depth_mm(self, rays: Rays, faces: NDArray[np.int32]) -> NDArray[np.float64]:
         """(h, w) z where each ray crosses the plane of its triangle, inf where it has none."""

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from synthetless.annotation.instances import PosedModel, Window, image_window
-from synthetless.annotation.raycast import MISS, Plane, PosedSurface, RayCaster, Rays, pixels_where
+from synthetless.annotation.raycast import MISS, Plane, PosedSurface, RayCaster, Rays
 from synthetless.errors import UserError
 from synthetless.scenes.spec import Intrinsics
 from synthetless.symmetry.groups import SymmetryGroup
@@ -38,8 +38,9 @@ FINEST_MM = 0.3
 THETA_DEG = 10.0
 """Normals that differ by more can be told apart by their shading."""
 
-_STEP, _MANY = 3, 10
-"""So many of every third pixel in both directions spare looking at all of them."""
+_MANY = 10
+"""So many of a few pixels spare looking at all of them."""
+_ALIKE = math.cos(math.radians(THETA_DEG))
 _NEIGHBOURS = np.ones((3, 3), np.uint8)
 
 Mask = NDArray[np.bool_]
@@ -185,6 +186,14 @@ class View:
     depth_mm: Floats
     normals: Floats | None = None
 
+    @classmethod
+    def of(cls, body: PosedSurface, rays: Rays, what: What) -> View:
+        """Cast every ray of a window."""
+        rows, columns = np.divmod(np.arange(math.prod(rays.window.shape)), max(1, rays.window.shape[1]))
+        depth_mm, normals = _cast(body, rays.at(rows, columns), what)
+        shape = rays.window.shape
+        return cls(depth_mm.reshape(shape), None if normals is None else normals.reshape(*shape, 3))
+
 
 def pixels_apart(true: View, other: View, occluder_mm: ArrayLike, what: What, eps_mm: float) -> int:
     """At how many pixels two poses of an object can be told apart.
@@ -199,50 +208,128 @@ def pixels_apart(true: View, other: View, occluder_mm: ArrayLike, what: What, ep
         what: what is compared.
         eps_mm: of depths.
     """
-    differs = _unexplained(true, other, what, eps_mm) | _unexplained(other, true, what, eps_mm)
-    return int(np.count_nonzero(differs & _in_front(true, other, np.asarray(occluder_mm))))
+    in_front_of = _bordered(np.asarray(occluder_mm, np.float64), -np.inf)
+    comparison = _Comparison(_Grid.of(true, what), _Grid.of(other, what), in_front_of, eps_mm)
+    return comparison.count_apart(comparison.differing(np.flatnonzero(_inside(true.depth_mm.shape))))
 
 
-def _in_front(true: View, other: View, occluder_mm: Floats) -> Mask:
-    visible: Mask = occluder_mm > np.minimum(true.depth_mm, other.depth_mm)
-    return visible
+def _cast(body: PosedSurface, directions: Floats, what: What) -> tuple[Floats, Floats | None]:
+    """z (N,) along rays (N, 3), camera frame, and normals (N, 3) if they are compared; as in ``View``."""
+    faces, depth_mm = body.first_hits(directions)
+    if what != "normals":
+        return depth_mm, None
+    hit = np.flatnonzero(faces != MISS)
+    found = body.normals(faces[hit])
+    normals = np.zeros((len(faces), 3))
+    normals[hit] = -np.copysign(1.0, np.einsum("ij,ij->i", found, directions[hit]))[:, None] * found
+    return depth_mm, normals
 
 
-def _unexplained(view: View, by: View, what: What, eps_mm: float, step: int = 1) -> Mask:
-    """Where a view shows what another one shows neither there nor at a neighbour; ``view`` has every step-th pixel."""
-    depth, of = view.depth_mm, by.depth_mm
-    if what != "depth":
-        depth, of = _flat(depth), _flat(of)
-    low, high = (bound[::step, ::step] for bound in _range(of))
-    apart: Mask = (depth < low - eps_mm) | (depth > high + eps_mm)
-    if what == "normals":
-        if view.normals is None or by.normals is None:
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """A view, or what was cast of it so far: its pixels row by row, with a border of one pixel.
+
+    Attributes:
+        columns: in a row, the border's included.
+        depth_mm: (n,) NaN in the border and where nothing was cast.
+        level: (n,) what is compared beside normals: the depth itself, or 0 and inf where only the outline counts.
+        normals: (n, 3), or None unless they are compared.
+    """
+
+    columns: int
+    depth_mm: Floats
+    level: Floats
+    normals: Floats | None
+
+    @classmethod
+    def of(cls, view: View, what: What) -> _Grid:
+        """All of a view."""
+        if what == "normals" and view.normals is None:
             raise ValueError("normals are to be compared, and there are none")
-        both = np.isfinite(depth) & np.isfinite(of[::step, ::step])
-        apart |= both & _unlike(view.normals, by.normals, step)
-    return apart
+        grid = cls.empty(view.depth_mm.shape, what)
+        normals = None if view.normals is None else view.normals.reshape(-1, 3)
+        grid.put(np.flatnonzero(_inside(view.depth_mm.shape)), view.depth_mm.ravel(), normals)
+        return grid
+
+    @classmethod
+    def empty(cls, shape: tuple[int, ...], what: What) -> _Grid:
+        """Nothing of a window yet."""
+        n = (shape[0] + 2) * (shape[1] + 2)
+        depth_mm = np.full(n, np.nan)
+        level = depth_mm if what == "depth" else np.full(n, np.nan)
+        return cls(shape[1] + 2, depth_mm, level, np.zeros((n, 3)) if what == "normals" else None)
+
+    def put(self, pixels: Integers, depth_mm: Floats, normals: Floats | None) -> None:
+        """Add what was cast at pixels."""
+        self.depth_mm[pixels] = depth_mm
+        if self.level is not self.depth_mm:
+            self.level[pixels] = np.where(np.isfinite(depth_mm), 0.0, np.inf)
+        if self.normals is not None:
+            self.normals[pixels] = normals
+
+    def around(self, pixels: Integers) -> Integers:
+        """(N, 9) pixels (N,) with their neighbours."""
+        steps = np.arange(-1, 2)
+        around: Integers = pixels[:, None] + (steps[:, None] * self.columns + steps).ravel()
+        return around
 
 
-def _range(depth_mm: Floats) -> tuple[Floats, Floats]:
-    """Least and greatest of each pixel and its neighbours inside the window."""
-    return np.asarray(cv2.erode(depth_mm, _NEIGHBOURS)), np.asarray(cv2.dilate(depth_mm, _NEIGHBOURS))
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """Two poses of an object, pixel by pixel.
+
+    Attributes:
+        true, other: the object alone.
+        occluder_mm: (n,) z of the nearest other body.
+        eps_mm: of depths.
+    """
+
+    true: _Grid
+    other: _Grid
+    occluder_mm: Floats
+    eps_mm: float
+
+    def differing(self, pixels: Integers) -> Integers:
+        """Those of the pixels that count and at which the two differ, their neighbours left aside."""
+        a, b = self.true.level[pixels], self.other.level[pixels]
+        differ = (a < b - self.eps_mm) | (a > b + self.eps_mm)
+        if self.true.normals is not None and self.other.normals is not None:
+            cosine = np.einsum("ij,ij->i", self.true.normals[pixels], self.other.normals[pixels])
+            differ |= np.isfinite(a) & np.isfinite(b) & (cosine < _ALIKE)
+        nearer = np.fmin(self.true.depth_mm[pixels], self.other.depth_mm[pixels])
+        return pixels[differ & (self.occluder_mm[pixels] > nearer)]
+
+    def count_apart(self, differing: Integers) -> int:
+        """At how many of such pixels one of the two shows what the other shows neither there nor at a neighbour."""
+        apart = self._unexplained(self.true, self.other, differing) | self._unexplained(
+            self.other, self.true, differing
+        )
+        return int(np.count_nonzero(apart))
+
+    def count_certain(self, differing: Integers) -> int:
+        """At how many of them the other pose shows such a thing, which can be said before its neighbours are cast."""
+        return int(np.count_nonzero(self._unexplained(self.other, self.true, differing)))
+
+    def _unexplained(self, view: _Grid, by: _Grid, pixels: Integers) -> Mask:
+        around = by.around(pixels)
+        level, near = view.level[pixels], by.level[around]
+        low, high = np.fmin.reduce(near, axis=1), np.fmax.reduce(near, axis=1)
+        apart: Mask = (level < low - self.eps_mm) | (level > high + self.eps_mm)
+        if view.normals is not None and by.normals is not None:
+            cosine = np.einsum("ij,ikj->ik", view.normals[pixels], by.normals[around])
+            both = np.isfinite(level) & np.isfinite(by.level[pixels])
+            apart |= both & (cosine.max(axis=1) < _ALIKE)
+        return apart
 
 
-def _flat(depth_mm: Floats) -> Floats:
-    return np.where(np.isfinite(depth_mm), 0.0, np.inf)
+def _bordered(values: NDArray[Any], border: float) -> NDArray[Any]:
+    """(h, w) as pixels row by row, with a border of one pixel."""
+    return np.pad(values, 1, constant_values=border).ravel()
 
 
-def _unlike(a: Floats, b: Floats, step: int) -> Mask:
-    """Where none of the neighbours in ``b`` has a normal like that of ``a``."""
-    h, w = b.shape[:2]
-    around = np.pad(b, ((1, 1), (1, 1), (0, 0)))
-    cosine = np.full(a.shape[:2], -1.0)
-    for i in range(3):
-        for j in range(3):
-            neighbour = around[i : i + h : step, j : j + w : step]
-            np.maximum(cosine, np.einsum("ijk,ijk->ij", a, neighbour), out=cosine)
-    unlike: Mask = cosine < math.cos(math.radians(THETA_DEG))
-    return unlike
+def _inside(shape: tuple[int, ...]) -> Mask:
+    """Of a window's pixels with their border, which are not in the border."""
+    return _bordered(np.ones(shape, np.bool_), False)
 
 
 # Images
@@ -255,7 +342,7 @@ class Ambiguity:
     Attributes:
         coset_true: the coset of its pose.
         pixels_apart: (k,) at how many pixels each coset can be told from it; 0 at the true one. Large numbers are
-            estimated from every third pixel.
+            estimated from every eighth or second pixel, and single pixels away from all others may be missing.
         eps_mm: how finely depths were compared.
         R_m2c, t_m2c: (k, 3, 3) and (k, 3) mm, the pose of each coset.
     """
@@ -309,22 +396,85 @@ def see(
     if 0 not in window.shape:
         rays = Rays.through(camera, window)
         occluder_mm = nearest_depth_mm([caster.pose(other) for other in others], plane, camera, rays)
-        seen = _view(surface, rays, resolution.what)
+        image = _Image.of(surface, min(body.nearest_mm for body in bodies), rays, occluder_mm, resolution.what, eps_mm)
         for number, body in enumerate(bodies):
             if number != true:
-                apart[number] = _count_apart(seen, body, rays, occluder_mm, resolution.what, eps_mm)
+                apart[number] = image.count_apart(body)
     return Ambiguity(true, apart, eps_mm, R, t)
 
 
-def _count_apart(seen: View, body: PosedSurface, rays: Rays, occluder_mm: Floats, what: What, eps_mm: float) -> int:
-    """``pixels_apart``; where every third pixel shows that there are many, what those tell."""
-    view = _view(body, rays.every(_STEP), what)
-    thin = View(seen.depth_mm[::_STEP, ::_STEP])
-    differs = _unexplained(view, seen, what, eps_mm, _STEP) & _in_front(thin, view, occluder_mm[::_STEP, ::_STEP])
-    count = int(np.count_nonzero(differs))
-    if count >= _MANY:
-        return count * _STEP**2
-    return pixels_apart(seen, _view(body, rays, what), occluder_mm, what, eps_mm)
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """What an image shows of an instance, to compare other poses of it with, of which as little is cast as will do.
+
+    First every eighth pixel, then every second one, as on a chessboard, then those around each one that differs. A
+    difference of two pixels that touch is never missed. Nothing is cast where another body hides both poses.
+
+    Attributes:
+        true: the object at its true pose.
+        occluder_mm: (n,) z of the nearest other body.
+        rays: of the window.
+        stages: pixels that are cast one after the other, each with the rays through them.
+        castable: (n,) the pixels that may count, and their neighbours.
+        what, eps_mm: what is compared, and how finely.
+    """
+
+    true: _Grid
+    occluder_mm: Floats
+    rays: Rays
+    stages: tuple[tuple[Integers, Floats], ...]
+    castable: Mask
+    what: What
+    eps_mm: float
+
+    @classmethod
+    def of(
+        cls, body: PosedSurface, nearest_mm: float, rays: Rays, occluder_mm: Floats, what: What, eps_mm: float
+    ) -> _Image:
+        """Cast the object at its true pose; no pose of it reaches closer to the camera than ``nearest_mm``."""
+        view = View.of(body, rays, what)
+        may_count = occluder_mm > np.minimum(view.depth_mm, nearest_mm)
+        castable = np.asarray(cv2.dilate(may_count.astype(np.uint8), _NEIGHBOURS), np.bool_)
+        rows, columns = (np.arange(length) for length in rays.window.shape)
+        even = (rows[:, None] + columns) % 2 == 0
+        first = ((rows % 2 == 0)[:, None]) & ((rows[:, None] + columns) % 4 == 0)
+        stages = [np.flatnonzero(_bordered(castable & chosen, False)) for chosen in (first, even & ~first)]
+        return cls(
+            _Grid.of(view, what),
+            _bordered(occluder_mm, -np.inf),
+            rays,
+            tuple((pixels, _directions(rays, pixels)) for pixels in stages),
+            _bordered(castable, False),
+            what,
+            eps_mm,
+        )
+
+    def count_apart(self, body: PosedSurface) -> int:
+        """``pixels_apart`` of another pose; where few pixels show that there are many, what those tell."""
+        other = _Grid.empty(self.rays.window.shape, self.what)
+        comparison = _Comparison(self.true, other, self.occluder_mm, self.eps_mm)
+        differing, certain, cast = np.empty(0, np.int64), 0, 0
+        for pixels, directions in self.stages:
+            other.put(pixels, *_cast(body, directions, self.what))
+            found = comparison.differing(pixels)
+            differing, cast = np.concatenate([differing, found]), cast + len(pixels)
+            certain += comparison.count_certain(found)
+            if certain >= _MANY:
+                return round(certain * np.count_nonzero(self.castable) / cast)
+        found = differing
+        while len(found):
+            pixels = np.unique(other.around(found))
+            pixels = pixels[self.castable[pixels] & np.isnan(other.depth_mm[pixels])]
+            other.put(pixels, *_cast(body, _directions(self.rays, pixels), self.what))
+            found = comparison.differing(pixels)
+            differing = np.concatenate([differing, found])
+        return comparison.count_apart(differing)
+
+
+def _directions(rays: Rays, pixels: Integers) -> Floats:
+    """(N, 3) the rays through pixels of a window with its border."""
+    rows, columns = np.divmod(pixels, rays.window.shape[1] + 2)
+    return rays.at(rows - 1, columns - 1)
 
 
 def nearest_depth_mm(bodies: Sequence[PosedSurface], plane: Plane | None, camera: Intrinsics, rays: Rays) -> Floats:
@@ -338,19 +488,6 @@ def nearest_depth_mm(bodies: Sequence[PosedSurface], plane: Plane | None, camera
             crop = part.slices_in(window)
             nearest[crop] = np.minimum(nearest[crop], body.depth_mm(through, body.first_faces(through)))
     return nearest
-
-
-def _view(body: PosedSurface, rays: Rays, what: What) -> View:
-    faces = body.first_faces(rays)
-    depth_mm = body.depth_mm(rays, faces)
-    if what != "normals":
-        return View(depth_mm)
-    rows, columns = pixels_where(faces != MISS)
-    found = body.normals(faces[rows, columns])
-    towards = -np.copysign(1.0, np.einsum("ij,ij->i", found, rays.at(rows, columns)))
-    normals = np.zeros((*faces.shape, 3))
-    normals[rows, columns] = found * towards[:, None]
-    return View(depth_mm, normals)
 
 
 def _union(windows: Sequence[Window]) -> Window:
