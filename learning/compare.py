@@ -1,13 +1,16 @@
 """The proof: the same network, crops and steps under several label sets, and what comes of it.
 
-Crops are ray cast (``stream``); a run is one label set and one seed, on one thread, the runs side by side.
+Crops are ray cast (``stream``); a run is one label set and one seed, on one thread, the runs side by side. A finished
+run stays in the folder, so that an interrupted comparison goes on, and another measurement does not train again.
 """
 
 from __future__ import annotations
 
+import copy
+import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +21,13 @@ from numpy.typing import NDArray
 
 from synthetless.dataset.reader import Dataset
 from synthetless.errors import UserError
-from synthetless.io.files import atomic_write, write_json
+from synthetless.io.files import atomic_folder, atomic_write, read_json, write_json
 from synthetless.io.images import encode_png
 from synthetless.io.models import ObjectModel, load_models
 from synthetless.io.parallel import each
 from synthetless.learning.crops import CropBatcher, CropNet
 from synthetless.learning.data import crops_of, sample_of
-from synthetless.learning.fit import Record, Schedule, fit
+from synthetless.learning.fit import Losses, Record, Schedule, fit, load, load_weights, save
 from synthetless.learning.pages import Curve, Section, line_chart, write_page
 from synthetless.learning.solve import solve_pose
 from synthetless.learning.stream import Crops, CropSettings, CropStream
@@ -40,6 +43,7 @@ _UPRIGHT_DEG = 10.0
 """How far the axis of a part that stands upright may lean."""
 _VISIBLE = 0.6
 """Share of a rendered part that must be visible."""
+SETTINGS_FILE = "settings.json"
 _FILES = ("pixels", "obj_ids", "R_m2c", "t_m2c", "K", "elevation_deg")
 _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)]
 _PICTURES, _PICTURE_PX = 24, 144
@@ -60,6 +64,9 @@ class Comparison:
         rendered: dataset folder on whose instances the networks are also measured, those that are mostly visible; of
             networks for upright parts those that stand upright.
         full_weight_deg: weight the corners' loss by the margin, which counts in full from here on; None does not.
+        width: channels of the network's first layer.
+        tuning: another dataset folder, from whose instances the networks learn afterwards, to be measured again.
+        tuning_steps: how long; the learning rate is a quarter.
     """
 
     models: Path
@@ -73,9 +80,12 @@ class Comparison:
     crops: CropSettings = field(default_factory=CropSettings)
     rendered: Path | None = None
     full_weight_deg: float | None = None
+    width: int = 16
+    tuning: Path | None = None
+    tuning_steps: int = 300
 
     def __post_init__(self) -> None:
-        for name in ("seeds", "steps", "batch", "train_crops", "validation_crops"):
+        for name in ("seeds", "steps", "batch", "train_crops", "validation_crops", "width", "tuning_steps"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} is {getattr(self, name)}; at least 1 is needed")
         if not self.labels:
@@ -83,6 +93,8 @@ class Comparison:
         for labels in self.labels:
             if labels not in LABEL_SETS:
                 raise UserError(f"unknown label set {labels!r}: use some of {', '.join(LABEL_SETS)}")
+        if self.tuning is not None and self.rendered is None:
+            raise UserError("a dataset to tune on is given, but none of rendered images to measure on")
 
 
 @dataclass(frozen=True)
@@ -133,18 +145,23 @@ class _Task:
 def compare(comparison: Comparison, out: Path, workers: int | None = None) -> list[Run]:
     """Run everything and write ``index.html``, ``runs.json`` and pictures into a folder.
 
+    What an earlier call with the same settings has finished there, crops and networks, is used again.
+
     Raises:
-        UserError: a model is missing, or the folder cannot be written.
+        UserError: a model is missing, or the folder cannot be written or holds a comparison with other settings.
     """
-    load_models(comparison.models, comparison.objects)
-    folder = out / "crops"
+    models = load_models(comparison.models, comparison.objects)
+    _claim(out, comparison, models)
     shares = [("train", comparison.train_crops, 1), ("validation", comparison.validation_crops, 2)]
     for name, count, seed in shares:
+        folder = out / "crops" / name
+        if folder.exists():
+            continue
         parts = [(comparison, seed, first, min(500, count - first)) for first in range(0, count, 500)]
-        made = Crops.concatenate(list(each(_make_crops, parts, workers, f"{name} crops", "share")))
-        (folder / name).mkdir(parents=True, exist_ok=True)
-        for column in _FILES:
-            np.save(folder / name / f"{column}.npy", getattr(made, column))
+        _keep(Crops.concatenate(list(each(_make_crops, parts, workers, f"{name} crops", "share"))), folder)
+    for name, dataset in (("rendered", comparison.rendered), ("tuning", comparison.tuning)):
+        if dataset is not None:
+            _keep(rendered_crops(comparison, dataset), out / "crops" / name)
     tasks = [_Task(comparison, labels, seed, out) for seed in range(comparison.seeds) for labels in comparison.labels]
     runs = list(each(_run, tasks, workers, "runs", "run"))
     write_json(out / "runs.json", {f"{run.labels} {run.seed}": _plain(run) for run in runs})
@@ -152,10 +169,43 @@ def compare(comparison: Comparison, out: Path, workers: int | None = None) -> li
     return runs
 
 
+def _claim(out: Path, comparison: Comparison, models: Mapping[int, ObjectModel]) -> None:
+    """Note in the folder what the runs in it follow from, or refuse it if that is something else."""
+    wanted = {
+        "steps": comparison.steps,
+        "batch": comparison.batch,
+        "train_crops": comparison.train_crops,
+        "validation_crops": comparison.validation_crops,
+        "crops": asdict(comparison.crops),
+        "full_weight_deg": comparison.full_weight_deg,
+        "width": comparison.width,
+        "models": {str(obj_id): model.digest for obj_id, model in models.items()},
+        "symmetries": {
+            str(obj_id): {name: value for name, value in model.info.items() if name.startswith("symmetries")}
+            for obj_id, model in models.items()
+        },
+    }
+    wanted = json.loads(json.dumps(wanted))  # as the file gives it back
+    path = out / SETTINGS_FILE
+    if path.exists():
+        kept = read_json(path)
+        for name, value in wanted.items():
+            if kept.get(name) != value:
+                raise UserError(f"{out}: holds a comparison with other settings ({name}); give another folder")
+    else:
+        write_json(path, wanted)
+
+
 def _make_crops(part: tuple[Comparison, int, int, int]) -> Crops:
     comparison, seed, first, count = part
     stream = CropStream(load_models(comparison.models, comparison.objects), comparison.crops, seed)
     return stream.crops(first, count)
+
+
+def _keep(crops: Crops, folder: Path) -> None:
+    with atomic_folder(folder, replace=True) as draft:
+        for column in _FILES:
+            np.save(draft / f"{column}.npy", getattr(crops, column))
 
 
 def _load_crops(folder: Path) -> Crops:
@@ -168,17 +218,41 @@ def _run(task: _Task) -> Run:
     torch.set_num_threads(1)
     comparison = task.comparison
     models = load_models(comparison.models, comparison.objects)
-    crops = {name: _load_crops(task.folder / "crops" / name) for name in ("train", "validation")}
-    trained = train_crops(comparison, models, crops["train"], crops["validation"], task.labels, task.seed)
+    names = [
+        "train",
+        "validation",
+        *(["rendered"] if comparison.rendered is not None else []),
+        *(["tuning"] if comparison.tuning is not None else []),
+    ]
+    crops = CropSets(*(_load_crops(task.folder / "crops" / name) for name in names))
+    kept = task.folder / "runs" / f"{task.labels}-{task.seed}.pt"
+    trained = train_crops(comparison, models, crops, task.labels, task.seed, kept)
     if task.seed == 0:
-        picture = _pictures(trained.corners, crops["validation"])
+        picture = _pictures(trained.corners, crops.validation)
         atomic_write(task.folder / "pictures" / f"{task.labels}.png", encode_png(picture))
     return trained.run
 
 
 @dataclass(frozen=True, eq=False)
+class CropSets:
+    """What is learned from, and what is measured on.
+
+    Attributes:
+        train: ray-cast crops to learn from.
+        validation: others to measure on.
+        rendered: rendered ones to measure on, too.
+        tuning: rendered ones to learn from afterwards.
+    """
+
+    train: Crops
+    validation: Crops
+    rendered: Crops | None = None
+    tuning: Crops | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Trained:
-    """A run, the network, and its corners (N, 8, 2) in pixels of the validation crops."""
+    """A run, the network, and its corners (N, 8, 2) in pixels of the validation crops, all before it was tuned."""
 
     run: Run
     net: CropNet
@@ -188,38 +262,102 @@ class Trained:
 def train_crops(
     comparison: Comparison,
     models: Mapping[int, ObjectModel],
-    train: Crops,
-    validation: Crops,
+    crops: CropSets,
     labels: LabelSet,
     seed: int,
-    width: int = 16,
+    kept: Path | None = None,
 ) -> Trained:
-    """One run: train on crops under a label set, and measure on others; ``width`` is the network's."""
+    """One run: train on crops under a label set, and measure on others.
+
+    Args:
+        comparison: see there.
+        models: of the objects.
+        crops: what is learned from, and what is measured on.
+        labels, seed: which run.
+        kept: file of the trained network: read if it exists, else written.
+
+    Raises:
+        UserError: the file is damaged or of another network.
+    """
     torch.manual_seed(seed)
     table = SymmetryTable.from_models_info({obj_id: model.info for obj_id, model in models.items()})
     boxes = {obj_id: model.box_corners_mm for obj_id, model in models.items()}
-    batcher = CropBatcher(LabelMaker(labels, table), boxes, sorted(models))
-    net = CropNet(comparison.crops.size_px, len(models), batcher.regressors, width)
-    held_out = batcher.batch(validation)
-    roll_deg = 180.0 if comparison.crops.poses == "any" else comparison.crops.roll_deg
+    maker = LabelMaker(labels, table)
+    batcher = CropBatcher(maker, boxes, sorted(models))
+    net = CropNet(comparison.crops.size_px, len(models), batcher.regressors, comparison.width)
+    if kept is not None and kept.exists():
+        records = _read_net(net, kept)
+    else:
+        lesson = _Lesson(net, batcher, comparison, seed)
+        records = lesson.learn(crops.train, crops.validation)
+        if kept is not None:
+            save(kept, {"model": net.state_dict(), "records": records})
+    judge = _Judge(net, batcher, maker, table, boxes)
+    rows, corners_px = judge.rows(crops.validation)
+    run = Run(labels, seed, records, rows)
+    if crops.rendered is not None:
+        rows |= _prefixed("rendered", judge.rows(crops.rendered)[0])
+    trained = Trained(run, net, corners_px)
+    if crops.rendered is not None and crops.tuning is not None:
+        tuned = copy.deepcopy(net)
+        _Lesson(tuned, batcher, comparison, seed).tune(crops.tuning)
+        rows |= _prefixed("tuned", replace(judge, net=tuned).rows(crops.rendered)[0])
+    return trained
 
-    def losses(step: int) -> Mapping[str, torch.Tensor]:
-        rng = np.random.default_rng([seed, 3, step])
-        rows = rng.integers(0, len(train), comparison.batch)
-        batch = batcher.augmented(train.take(rows), rng, roll_deg)
-        return batch.losses(net(batch.pixels), comparison.full_weight_deg)
 
-    def measure() -> Mapping[str, float]:
-        return {"val_l1": float(batch_losses(net, held_out.pixels, held_out)["corners"])}
+def _read_net(net: CropNet, path: Path) -> list[Record]:
+    """Give a network the weights that a file keeps; the log of its training."""
+    content = load(path)
+    if not content.get("records"):
+        raise UserError(f"{path}: is no network of a comparison")
+    load_weights(net, content.get("model", {}), path)
+    records: list[Record] = content["records"]
+    return records
 
-    schedule = Schedule(comparison.steps, log_every=max(1, comparison.steps // 15))
-    records = list(fit(net, losses, schedule, measure=measure))
-    judge = _Judge(net, batcher, LabelMaker(labels, table), table, boxes)
-    rows, corners_px = judge.rows(validation)
-    if comparison.rendered is not None:
-        on_renders, _ = judge.rows(rendered_crops(comparison))
-        rows |= {f"rendered, {name}": row for name, row in on_renders.items()}
-    return Trained(Run(labels, seed, records, rows), net, corners_px)
+
+def _prefixed(name: str, rows: Mapping[str, Row]) -> dict[str, Row]:
+    return {f"{name}, {of}": row for of, row in rows.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class _Lesson:
+    """Trains a network; the batches follow from the seed and the step."""
+
+    net: CropNet
+    batcher: CropBatcher
+    comparison: Comparison
+    seed: int
+
+    def learn(self, train: Crops, validation: Crops) -> list[Record]:
+        """On ray-cast crops, with the L1 of the corners on others in the log."""
+        held_out = self.batcher.batch(validation)
+
+        def measure() -> Mapping[str, float]:
+            with torch.no_grad():
+                return {"val_l1": float(held_out.losses(self.net(held_out.pixels))["corners"])}
+
+        steps = self.comparison.steps
+        schedule = Schedule(steps, log_every=max(1, steps // 15))
+        return list(fit(self.net, self._losses(train, 3), schedule, measure=measure))
+
+    def tune(self, crops: Crops) -> None:
+        """On rendered ones, gently."""
+        steps = self.comparison.tuning_steps
+        schedule = Schedule(steps, peak_rate=Schedule.peak_rate / 4, log_every=steps)
+        for _ in fit(self.net, self._losses(crops, 4), schedule):
+            pass
+
+    def _losses(self, crops: Crops, stream: int) -> Losses:
+        comparison = self.comparison
+        roll_deg = 180.0 if comparison.crops.poses == "any" else comparison.crops.roll_deg
+
+        def losses(step: int) -> Mapping[str, torch.Tensor]:
+            rng = np.random.default_rng([self.seed, stream, step])
+            rows = rng.integers(0, len(crops), comparison.batch)
+            batch = self.batcher.augmented(crops.take(rows), rng, roll_deg)
+            return batch.losses(self.net(batch.pixels), comparison.full_weight_deg)
+
+        return losses
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,14 +406,13 @@ def _groups(crops: Crops, margins_deg: Floats) -> Iterator[tuple[str, NDArray[np
             yield f"margin {low:g} to {high:.4g}", inside
 
 
-def rendered_crops(comparison: Comparison) -> Crops:
-    """Crops of the dataset ``comparison.rendered``, as virtual cameras that look straight at the parts see them.
+def rendered_crops(comparison: Comparison, folder: Path) -> Crops:
+    """Crops of a dataset's instances, as virtual cameras that look straight at the parts see them.
 
     Raises:
         UserError: none of its instances can be used.
     """
-    assert comparison.rendered is not None
-    dataset = Dataset.open(comparison.rendered)
+    dataset = Dataset.open(folder)
     parts = []
     for image in dataset:
         sample = sample_of(image)
@@ -296,13 +433,6 @@ def rendered_crops(comparison: Comparison) -> Crops:
     if not parts:
         raise UserError(f"{dataset.root}: has no instance of the objects that is visible enough and stands as needed")
     return Crops.concatenate(parts)
-
-
-def batch_losses(net: CropNet, pixels: torch.Tensor, batch: Any) -> Mapping[str, torch.Tensor]:
-    """The batch's losses under the network, without gradients."""
-    with torch.no_grad():
-        losses: Mapping[str, torch.Tensor] = batch.losses(net(pixels))
-    return losses
 
 
 @dataclass(frozen=True, eq=False)
@@ -424,7 +554,10 @@ def write_comparison_page(comparison: Comparison, runs: Sequence[Run], out: Path
         count = runs[0].rows["rendered, all"].crops
         text = f"{count} crops of {comparison.rendered.name}; none of its images was learned from."
         sections.append(Section("On rendered images", text, COLUMNS, table_rows(runs, sets, "rendered, all")))
-    names = sorted({name for run in runs for name in run.rows} - {"all", "rendered, all"}, key=_in_order)
+    if comparison.tuning is not None:
+        text = f"The same crops after {comparison.tuning_steps} more steps on crops of {comparison.tuning.name}."
+        sections.append(Section("After tuning", text, COLUMNS, table_rows(runs, sets, "tuned, all")))
+    names = sorted({name for run in runs for name in run.rows} - {"all", "rendered, all", "tuned, all"}, key=_in_order)
     columns = ("recall at 10 degrees", *sets)
     recalls = [
         (name, *(_cell([row.recalls[1] for row in _of(runs, labels, name)], ".0%") for labels in sets))

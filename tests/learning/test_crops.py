@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,14 @@ torch = package_or_skip("torch", "extra 'learn' has it")
 from synthetless.dataset import Dataset  # noqa: E402
 from synthetless.errors import UserError  # noqa: E402
 from synthetless.io.models import load_models  # noqa: E402
+from synthetless.learning import compare as comparing  # noqa: E402
 from synthetless.learning import fit as fitting  # noqa: E402
-from synthetless.learning.compare import Comparison, compare, rendered_crops, train_crops  # noqa: E402
+from synthetless.learning.compare import Comparison, CropSets, compare, rendered_crops, train_crops  # noqa: E402
 from synthetless.learning.crops import CropBatcher, CropNet, _turn  # noqa: E402
 from synthetless.learning.heads import PoseHead, existing, pose_losses  # noqa: E402
 from synthetless.learning.solve import solve_pose  # noqa: E402
 from synthetless.learning.stream import CropSettings, CropStream, upright  # noqa: E402
-from synthetless.learning.targets import LABEL_SETS, LabelMaker, rolled, turned  # noqa: E402
+from synthetless.learning.targets import LABEL_SETS, LabelMaker, LabelSet, rolled, turned  # noqa: E402
 from synthetless.symmetry import SymmetryTable  # noqa: E402
 
 OBJECTS = (18, 27, 29, 30)
@@ -152,12 +154,12 @@ def test_collapsed_corners_are_a_miss_and_no_crash(corners: Any, models: Any) ->
 def test_mapped_labels_are_learned_and_true_poses_are_not(models: Any) -> None:
     """The paper's point: 300 steps, the same network, crops and steps."""
     torch.set_num_threads(1)
-    comparison = Comparison(Path("unused"), steps=300, batch=48)
+    comparison = Comparison(Path("unused"), steps=300, batch=48, width=12)
     stream = CropStream(models, comparison.crops, 1)
-    train, validation = stream.crops(0, 2000), stream.crops(10_000, 300)
+    crops = CropSets(stream.crops(0, 2000), stream.crops(10_000, 300))
     l1, spread = {}, {}
     for labels in ("true", "map"):
-        row = train_crops(comparison, models, train, validation, labels, 0, width=12).run.rows["all"]
+        row = train_crops(comparison, models, crops, labels, 0).run.rows["all"]
         l1[labels], spread[labels] = row.l1, row.spread
     assert l1["map"] < 0.7 * l1["true"]
     assert spread["true"] < 0.6 < spread["map"]
@@ -176,6 +178,49 @@ def test_a_small_comparison_writes_its_page(builtin_models: Path, tmp_path: Path
     assert compare(comparison, tmp_path / "again", workers=1)[1].rows == runs[1].rows
 
 
+def test_an_interrupted_comparison_goes_on(
+    builtin_models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is finished is used again, what is missing is made, and the outcome is that of one call."""
+    sets: tuple[LabelSet, ...] = ("true", "map", "atlas")
+    out = tmp_path / "out"
+    whole = compare(Comparison(builtin_models, (27, 30), sets, 1, 3, 8, 20, 12), tmp_path / "whole", 1)
+
+    def interrupted(task: Any) -> Any:
+        if task.labels == "atlas":
+            raise KeyboardInterrupt
+        return run(task)
+
+    run = comparing._run
+    comparison = Comparison(builtin_models, (27, 30), sets, 1, 3, 8, 20, 12)
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(comparing, "_run", interrupted)
+        compare(comparison, out, 1)
+    kept = {path.name: path.stat().st_mtime_ns for path in (out / "runs").iterdir()}
+    assert sorted(kept) == ["map-0.pt", "true-0.pt"]
+    crops = {path: path.stat().st_mtime_ns for path in (out / "crops").rglob("*.npy")}
+    again = compare(comparison, out, 1)
+    assert {path: path.stat().st_mtime_ns for path in (out / "crops").rglob("*.npy")} == crops
+    assert {name: (out / "runs" / name).stat().st_mtime_ns for name in kept} == kept
+    assert [run.rows for run in again] == [run.rows for run in whole]
+    more = Comparison(builtin_models, (27, 30), ("map",), 2, 3, 8, 20, 12)  # other sets and seeds are other runs
+    assert [run.seed for run in compare(more, out, 1)] == [0, 1]
+
+
+def test_runs_of_other_settings_are_not_used_again(builtin_models: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    compare(Comparison(builtin_models, (27,), ("map",), 1, 2, 4, 12, 8), out, 1)
+    with pytest.raises(UserError, match=r"out: holds a comparison with other settings \(steps\); give another folder"):
+        compare(Comparison(builtin_models, (27,), ("map",), 1, 3, 4, 12, 8), out, 1)
+    with pytest.raises(UserError, match=r"other settings \(models\)"):
+        compare(Comparison(builtin_models, (30,), ("map",), 1, 2, 4, 12, 8), out, 1)
+    with pytest.raises(UserError, match=r"other settings \(crops\)"):
+        compare(Comparison(builtin_models, (27,), ("map",), 1, 2, 4, 12, 8, CropSettings(poses="any")), out, 1)
+    (out / "runs" / "map-0.pt").write_bytes(b"PK")
+    with pytest.raises(UserError, match=r"map-0\.pt: is no checkpoint, or is damaged"):
+        compare(Comparison(builtin_models, (27,), ("map",), 1, 2, 4, 12, 8), out, 1)
+
+
 def test_a_comparison_is_measured_on_a_dataset_too(valid: Path, tmp_path: Path) -> None:
     """Crops of the dataset's instances, in rows of their own."""
     crops = CropSettings(poses="any")
@@ -187,9 +232,15 @@ def test_a_comparison_is_measured_on_a_dataset_too(valid: Path, tmp_path: Path) 
         for n in image.instances
     )
     assert "On rendered images" in (tmp_path / "out" / "index.html").read_text()
-    upright = Comparison(valid / "models", (2, 3), ("map",), rendered=valid)
+    tuned = replace(comparison, tuning=valid, tuning_steps=40)  # learns from what it is measured on
+    (after,) = compare(tuned, tmp_path / "out", workers=1)
+    assert {name: row for name, row in after.rows.items() if not name.startswith("tuned")} == run.rows
+    assert after.rows["tuned, all"].crops == after.rows["rendered, all"].crops
+    assert after.rows["tuned, all"].l1 < 0.9 * after.rows["rendered, all"].l1
+    assert "After tuning" in (tmp_path / "out" / "index.html").read_text()
+    upright = Comparison(valid / "models", (2, 3), ("map",))
     with pytest.raises(UserError, match="no instance of the objects that is visible enough and stands as needed"):
-        rendered_crops(upright)  # they lie in any pose
+        rendered_crops(upright, valid)  # they lie in any pose
 
 
 def test_wrong_comparisons_are_one_line(builtin_models: Path, tmp_path: Path) -> None:
@@ -197,6 +248,8 @@ def test_wrong_comparisons_are_one_line(builtin_models: Path, tmp_path: Path) ->
         Comparison(builtin_models, labels=("maps",))  # type: ignore[arg-type]
     with pytest.raises(UserError, match="steps is 0"):
         Comparison(builtin_models, steps=0)
+    with pytest.raises(UserError, match="a dataset to tune on is given, but none of rendered images to measure on"):
+        Comparison(builtin_models, tuning=tmp_path)
     with pytest.raises(UserError, match="no mesh for object 99"):
         compare(Comparison(builtin_models, objects=(99,)), tmp_path, 1)
 
