@@ -58,6 +58,7 @@ class Losses(Protocol):
     def __call__(self, step: int) -> Mapping[str, Tensor]: ...
 
 
+NO_LOSSES = ("step", "seconds", "seconds_left", "rate")
 Record = dict[str, Any]
 """A line of the log: step, seconds since the start and left, rate, every loss as the mean since the last line, and what
 was measured."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -40,7 +40,7 @@ class Picture:
         scene_id, im_id, key: which it is.
         K: (3, 3) camera matrix.
         read: its pixels (H, W, 3).
-        instances: what is in it.
+        image: of the dataset, if it is of one.
     """
 
     scene_id: int
@@ -48,12 +48,22 @@ class Picture:
     key: str
     K: Floats
     read: Callable[[], NDArray[np.uint8]]
-    instances: Sequence[Instance] = ()
+    image: Image | None = None
 
     @classmethod
     def of(cls, image: Image) -> Picture:
         """An image of a dataset."""
-        return cls(image.scene_id, image.im_id, image.key, image.K, image.rgb, image.instances)
+        return cls(image.scene_id, image.im_id, image.key, image.K, image.rgb, image)
+
+    @property
+    def instances(self) -> Sequence[Instance]:
+        """What is in it, as far as it is known."""
+        return () if self.image is None else self.image.instances
+
+    @property
+    def has_boxes(self) -> bool:
+        """Whether the boxes of all that is in it are known."""
+        return self.image is not None and all(n.visibility is not None for n in self.instances)
 
 
 def pictures_of(source: Path, split: str | None = None, camera: Path | None = None) -> list[Picture]:
@@ -122,6 +132,19 @@ class Predictor:
         return estimates
 
 
+@dataclass(frozen=True)
+class Predicted:
+    """What came of a prediction.
+
+    Attributes:
+        poses: how many were found.
+        box_map: mAP of the boxes at an overlap of 0.5, over the images whose boxes are known; None without any.
+    """
+
+    poses: int
+    box_map: float | None
+
+
 def predict(
     run: Path,
     source: Path,
@@ -130,7 +153,7 @@ def predict(
     split: str | None = None,
     device: str = "auto",
     camera: Path | None = None,
-) -> int:
+) -> Predicted:
     """Predict the poses in all images of a dataset or folder.
 
     Args:
@@ -142,12 +165,10 @@ def predict(
         split: of the dataset.
         device: as for training.
         camera: see ``pictures_of``.
-
-    Returns:
-        How many poses were found.
     """
     predictor = Predictor(run, device)
     estimates: list[Estimate] = []
+    detected: list[tuple[Image, Detections]] = []
     for image in pictures_of(source, split, camera):
         pixels, started = image.read(), time.perf_counter()
         found = predictor.detect(pixels)
@@ -155,10 +176,13 @@ def predict(
         seconds = time.perf_counter() - started
         own = [Estimate(e.scene_id, e.im_id, e.obj_id, e.score, e.R_m2c, e.t_m2c, seconds) for e in own]
         estimates += own
+        if image.image is not None and image.has_boxes:
+            detected.append((image.image, found))
         if overlays is not None:
             atomic_write(overlays / f"{image.key}.png", encode_png(draw(pixels, image, own, predictor.parts)))
     write_results(to, estimates)
-    return len(estimates)
+    known = any(image.instances for image, _ in detected)
+    return Predicted(len(estimates), mean_average_precision(predictor.parts.ids, detected) if known else None)
 
 
 def draw(pixels: NDArray[np.uint8], image: Picture, estimates: Sequence[Estimate], parts: Parts) -> NDArray[np.uint8]:
@@ -184,18 +208,19 @@ def _draw_box(
         cv2.line(canvas, at[a].tolist(), at[b].tolist(), color, 1, cv2.LINE_AA)
 
 
-def detections_of(predictor: Predictor, images: Sequence[Image]) -> Iterator[tuple[Image, Detections]]:
-    """What is found in each image."""
-    for image in images:
-        yield image, predictor.detect(image.rgb())
+def mean_average_precision(
+    ids: Sequence[int], detected: Iterable[tuple[Image, Detections]], iou_threshold: float = 0.5
+) -> float:
+    """mAP of the boxes at one overlap, over the objects; instances less than a tenth visible do not count.
 
-
-def mean_average_precision(predictor: Predictor, images: Sequence[Image], iou_threshold: float = 0.5) -> float:
-    """mAP of the boxes at one overlap, over the objects; instances less than a tenth visible do not count."""
-    ids = predictor.parts.ids
+    Args:
+        ids: the objects, in the order of the classes.
+        detected: images whose true boxes are known, and what is found in each.
+        iou_threshold: the overlap.
+    """
     scored: dict[int, list[tuple[float, bool]]] = {obj_id: [] for obj_id in ids}
     asked = dict.fromkeys(ids, 0)
-    for image, found in detections_of(predictor, images):
+    for image, found in detected:
         sample = sample_of(image)
         for number, obj_id in enumerate(ids, start=1):
             mine = sample.obj_ids == obj_id

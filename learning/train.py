@@ -22,7 +22,7 @@ from synthetless.io.files import read_json, write_json
 from synthetless.io.models import load_models
 from synthetless.learning.data import FolderImages, Photographs, SampleBatcher, picture
 from synthetless.learning.detector import Detector, Instances
-from synthetless.learning.fit import CHECKPOINT_FILE, LOG_FILE, Record, Schedule, fit, load, read_log
+from synthetless.learning.fit import CHECKPOINT_FILE, LOG_FILE, NO_LOSSES, Record, Schedule, fit, load, read_log
 from synthetless.learning.pages import Section, line_chart, write_page
 from synthetless.learning.settings import Training
 from synthetless.learning.targets import LabelMaker
@@ -313,10 +313,37 @@ def _processes(device: str) -> Iterator[tuple[int, torch.device]]:
         torch.distributed.destroy_process_group()
 
 
+def write_curves(runs: Sequence[Path], to: Path) -> None:
+    """One figure for each loss, with a curve for each run.
+
+    Raises:
+        UserError: a folder is no run, or has no log yet; as in ``write_page``.
+    """
+    logs = {}
+    for run in runs:
+        training, _ = read_run(run)
+        log = read_log(run)
+        if not log:
+            raise UserError(f"{run / LOG_FILE}: has no records yet")
+        logs[f"{run.name} ({training.labels})"] = log
+    sections = []
+    for loss in _losses_of(next(iter(logs.values()))):
+        curves = {
+            name: ([float(record["step"]) for record in log], [float(record[loss]) for record in log])
+            for name, log in logs.items()
+        }
+        sections.append(Section(loss, svg=line_chart(curves, "step", loss)))
+    write_page(to, "Learning curves", sections)
+
+
+def _losses_of(log: Sequence[Record]) -> list[str]:
+    return [name for name in log[-1] if name not in NO_LOSSES] if log else []
+
+
 def write_training_page(run: Path) -> None:
     """The learning curves of a run; errors as in ``write_page``."""
     records = read_log(run)
-    names = [name for name in records[-1] if name not in ("step", "seconds", "seconds_left", "rate")] if records else []
+    names = _losses_of(records)
     steps = [float(record["step"]) for record in records]
     curves = {name: (steps, [float(record[name]) for record in records]) for name in names}
     sections = [Section(f"{LOG_FILE}: {len(records)} records", svg=line_chart(curves, "step", "loss"))]

@@ -12,8 +12,6 @@ import typer
 from synthetless.cli.options import AsJson, RecipeArgument, Split, Workers, above_zero
 from synthetless.cli.terminal import say
 
-_NO_LOSSES = ("step", "seconds", "seconds_left", "rate")
-
 
 def score_command(
     dataset: Annotated[Path, typer.Argument(help="Folder of a BOP dataset.")],
@@ -82,6 +80,11 @@ def compare_command(
     rendered: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Dataset of the same parts to measure the networks on, too.")
     ] = None,
+    tune: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Another one, to learn from afterwards and to be measured again."),
+    ] = None,
+    width: Annotated[int, typer.Option(min=1, metavar="N", help="Channels of the network's first layer.")] = 16,
     workers: Workers = None,
     as_json: AsJson = False,
 ) -> None:
@@ -105,18 +108,21 @@ def compare_command(
         crops=CropSettings(poses=poses),
         rendered=rendered,
         full_weight_deg=margin_weight,
+        width=width,
+        tuning=tune,
     )
     runs = compare(comparison, out, workers)
-    of_crops = table_rows(runs, comparison.labels)
-    of_rendered = [] if rendered is None else table_rows(runs, comparison.labels, "rendered, all")
+    tables = {"crops": table_rows(runs, comparison.labels)}
+    for name, dataset in (("rendered", rendered), ("tuned", tune)):
+        tables[name] = [] if dataset is None else table_rows(runs, comparison.labels, f"{name}, all")
     if as_json:
-        tables = {"crops": of_crops, "rendered": of_rendered}
-        named = {key: [dict(zip(COLUMNS, row, strict=True)) for row in rows] for key, rows in tables.items()}
+        named = {name: [dict(zip(COLUMNS, row, strict=True)) for row in table] for name, table in tables.items()}
         say(json.dumps({"page": str(out / "index.html"), **named}))
         return
-    rows = [COLUMNS, *of_crops]
-    if rendered is not None:
-        rows += [("rendered:", *[""] * (len(COLUMNS) - 1)), *of_rendered]
+    rows = [COLUMNS, *tables.pop("crops")]
+    for name, table in tables.items():
+        if table:
+            rows += [(f"{name}:", *[""] * (len(COLUMNS) - 1)), *table]
     widths = [max(len(row[i]) for row in rows) for i in range(len(COLUMNS))]
     for row in rows:
         say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
@@ -177,6 +183,7 @@ def train_command(
 
     given = [*(overrides or []), *([f'labels="{labels}"'] if labels is not None else [])]
     training = load_settings(Training, config, given)
+    from synthetless.learning.fit import NO_LOSSES
     from synthetless.learning.train import PAGE_FILE, train  # after the settings: a wrong one is told at once
 
     steps = training.schedule.steps
@@ -185,7 +192,7 @@ def train_command(
         if as_json:
             print(json.dumps(record), file=sys.stderr, flush=True)
             return
-        shown = ", ".join(f"{name} {value:.3f}" for name, value in record.items() if name not in _NO_LOSSES)
+        shown = ", ".join(f"{name} {value:.3f}" for name, value in record.items() if name not in NO_LOSSES)
         left = record["seconds_left"]
         say(f"step {record['step']} of {steps}: {shown}; {left / 60:.0f} min left")
 
@@ -215,5 +222,23 @@ def predict_command(
     need_torch()
     from synthetless.learning.predict import predict
 
-    count = predict(run, dataset, to, overlays, split, device, camera)
-    say(json.dumps({"poses": count, "file": str(to)}) if as_json else f"{count} poses in {to}")
+    found = predict(run, dataset, to, overlays, split, device, camera)
+    if as_json:
+        say(json.dumps({"poses": found.poses, "file": str(to), "box_map": found.box_map}))
+        return
+    say(f"{found.poses} poses in {to}")
+    if found.box_map is not None:
+        say(f"boxes: mAP {found.box_map:.3f} at an overlap of 0.5")
+
+
+def curves_command(
+    runs: Annotated[list[Path], typer.Argument(help="Folders of trainings.")],
+    to: Annotated[Path, typer.Option(metavar="FILE", help="HTML page to write.")],
+    as_json: AsJson = False,
+) -> None:
+    """Draw the learning curves of several trainings in one figure for each loss."""
+    need_torch()
+    from synthetless.learning.train import write_curves
+
+    write_curves(runs, to)
+    say(json.dumps({"page": str(to)}) if as_json else f"page: {to}")

