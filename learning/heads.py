@@ -59,6 +59,20 @@ def existing(logits: Tensor, counts: Tensor) -> Tensor:
     return logits.masked_fill(beyond, -torch.inf)
 
 
+def coset_loss(logits: Tensor, alike: Tensor, counts: Tensor) -> Tensor:
+    """Mean of -log of the probability of all cosets that the image leaves open: none of them is punished.
+
+    Args:
+        logits: (N, k) of the cosets; with ``targets.coset_targets``.
+        alike: (N, k) whether each is right.
+        counts: (N,) how many cosets each object has.
+    """
+    if len(counts) == 0:
+        return logits.sum() * 0
+    log_p = functional.log_softmax(existing(logits, counts), dim=1)
+    return -log_p.masked_fill(~alike, -torch.inf).logsumexp(dim=1).mean()
+
+
 def pose_losses(
     output: PoseOutput, corners: Tensor, index: Tensor, counts: Tensor, weights: Tensor | None = None
 ) -> dict[str, Tensor]:

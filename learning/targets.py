@@ -9,7 +9,7 @@ the regressors' regions by as much. Use crops of a virtual camera, or ``allocent
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, get_args
@@ -17,6 +17,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from synthetless.dataset.reader import Instance
 from synthetless.errors import UserError
 from synthetless.symmetry import CanonicalMap, SymmetryTable
 from synthetless.symmetry.quaternions import Floats, minimal, normalise, to_matrix
@@ -123,6 +124,46 @@ def _map(labels: LabelSet, table: SymmetryTable, obj_id: int, allocentric: bool)
     if labels == "pitteri2019-top":
         return replace(entry, reference_rotation=_FROM_ABOVE).canonical_map("pitteri2019", allocentric)
     return entry.canonical_map("atlas" if labels == "atlas" else "pitteri2019", allocentric)
+
+
+@dataclass(frozen=True, eq=False)
+class CosetTargets:
+    """Labels of N instances that are learned coarsely, then finely, of objects that are nearly symmetrical.
+
+    Attributes:
+        poses: canonical under the quasi-symmetry group H, with their regressors; margins are not known: NaN.
+        alike: (N, k) which left cosets h G of the exact group in H the image leaves open, all of them right answers.
+        n_cosets: (N,) how many of the columns exist.
+    """
+
+    poses: PoseTargets
+    alike: NDArray[np.bool_]
+    n_cosets: Integers
+
+
+def coset_targets(instances: Sequence[Instance], maker: LabelMaker) -> CosetTargets:
+    """The labels of a dataset's instances, as ``synthetless ambiguity`` has judged them.
+
+    What hides the detail belongs to the image, so these labels are read, not computed: an augmentation that turns the
+    camera needs the dataset judged anew.
+
+    Args:
+        instances: N of them. Those of objects without a quasi-symmetry group have one coset, and the pose of ``maker``.
+        maker: labels the others; egocentric, as the recorded labels are.
+    """
+    R, t = (np.array([getattr(n, name) for n in instances], dtype=np.float64) for name in ("R_m2c", "t_m2c"))
+    exact = maker([n.obj_id for n in instances], R.reshape(-1, 3, 3), t.reshape(-1, 3))
+    n_cosets = np.array([1 if n.quasi is None else len(n.quasi.alike) for n in instances], dtype=np.int64)
+    alike = np.zeros((len(instances), int(n_cosets.max(initial=1))), dtype=bool)
+    alike[:, 0] = True
+    margin = exact.margin_deg.copy()
+    for i, quasi in enumerate(n.quasi for n in instances):
+        if quasi is not None:
+            exact.R_m2c[i], exact.t_m2c[i] = quasi.R_m2c, quasi.t_m2c
+            exact.regressor_index[i], exact.n_regressors[i] = quasi.index, quasi.n_indices
+            margin[i] = np.nan
+            alike[i, : len(quasi.alike)] = quasi.alike
+    return CosetTargets(replace(exact, margin_deg=margin), alike, n_cosets)
 
 
 def looking_at(points_px: ArrayLike, K: ArrayLike) -> Floats:

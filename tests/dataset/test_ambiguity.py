@@ -28,7 +28,10 @@ from synthetless.dataset.relabel import adopt, relabel
 from synthetless.errors import UserError
 from synthetless.exports.coco import export_coco
 from synthetless.exports.webdataset import export_webdataset, relabel_webdataset
+from synthetless.learning.targets import LabelMaker, coset_targets
 from synthetless.preview.statistics import statistics
+from synthetless.symmetry.ambiguity import Cosets
+from synthetless.symmetry.quaternions import to_matrix
 from synthetless.validation import validate
 
 TABLE = """
@@ -94,6 +97,31 @@ def test_the_reader_gives_poses_that_look_alike(judged: Path) -> None:
             axis=1
         )
         assert off.min() < 1e-9
+
+
+def test_they_are_learned_coarsely_then_finely(judged: Path) -> None:
+    dataset = Dataset.open(judged)
+    seen = [instance for image in dataset for instance in image.instances]
+    table = dataset.symmetries
+    maker = LabelMaker("atlas", table)
+    labels = coset_targets(seen, maker)
+    exact = maker([n.obj_id for n in seen], np.array([n.R_m2c for n in seen]), np.array([n.t_m2c for n in seen]))
+    assert labels.alike.shape == (len(seen), 2)
+    for i, instance in enumerate(seen):
+        if instance.quasi is None:
+            assert labels.n_cosets[i] == 1 and labels.alike[i].tolist() == [True, False]
+            assert np.array_equal(labels.poses.R_m2c[i], exact.R_m2c[i])
+            assert labels.poses.margin_deg[i] == exact.margin_deg[i]
+            continue
+        assert labels.n_cosets[i] == 2 and labels.alike[i].tolist() == instance.quasi.alike.tolist()
+        assert np.isnan(labels.poses.margin_deg[i])
+        assert labels.poses.regressor_index[i] < labels.poses.n_regressors[i] == instance.quasi.n_indices
+        entry = table.entries[instance.obj_id]
+        assert entry.quasi is not None
+        turn = to_matrix(Cosets.of(entry.quasi.group, entry.group).representatives_wxyz[instance.quasi.coset_true])
+        fine = labels.poses.R_m2c[i] @ turn  # the coarse pose and the true coset are the true pose
+        assert entry.group.appearance_distance_deg(instance.R_m2c[None], fine[None])[0] < 1e-6
+    assert len(coset_targets([], maker).n_cosets) == 0
 
 
 def test_it_is_valid_and_every_damage_is_told(root: Path, small_scene_folders: None) -> None:

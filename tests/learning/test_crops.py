@@ -25,7 +25,7 @@ from synthetless.learning import compare as comparing  # noqa: E402
 from synthetless.learning import fit as fitting  # noqa: E402
 from synthetless.learning.compare import Comparison, CropSets, compare, rendered_crops, train_crops  # noqa: E402
 from synthetless.learning.crops import CropBatcher, CropNet, _turn  # noqa: E402
-from synthetless.learning.heads import PoseHead, existing, pose_losses  # noqa: E402
+from synthetless.learning.heads import PoseHead, coset_loss, existing, pose_losses  # noqa: E402
 from synthetless.learning.solve import solve_pose  # noqa: E402
 from synthetless.learning.stream import CropSettings, CropStream, upright  # noqa: E402
 from synthetless.learning.targets import LABEL_SETS, LabelMaker, LabelSet, rolled, turned  # noqa: E402
@@ -141,6 +141,18 @@ def test_corners_of_a_label_are_solved_to_its_pose(stream: CropStream, models: A
         pose = solve_pose(corners[i], models[int(crops.obj_ids[i])].box_corners_mm, crops.K[i])
         assert pose is not None
         assert np.abs(pose.R_m2c - crops.R_m2c[i]).max() < 0.01
+
+
+def test_every_coset_that_is_left_open_is_right() -> None:
+    p = torch.tensor([[0.7, 0.2, 0.1], [0.7, 0.2, 0.1], [0.5, 0.5, 0.0]])
+    alike = torch.tensor([[True, False, False], [False, True, True], [True, True, False]])
+    logits = torch.log(p).requires_grad_()
+    loss = coset_loss(logits, alike, torch.tensor([3, 3, 2]))
+    assert loss.item() == pytest.approx(-(np.log(0.7) + np.log(0.3) + np.log(1.0)) / 3, abs=1e-6)
+    loss.backward()
+    assert torch.isfinite(logits.grad).all() and logits.grad[2].abs().max() < 1e-6
+    nothing = coset_loss(logits[:0], alike[:0], torch.zeros(0, dtype=torch.int64))
+    assert nothing.item() == 0
 
 
 @pytest.mark.parametrize(
