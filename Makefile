@@ -26,8 +26,9 @@ demo: setup  ## a small dataset of the built-in parts, in out/demo
 test: setup  ## every test, real renders included
 	$(BIN)/pytest --numprocesses logical --dist loadfile --no-loadscope-reorder
 
-interop: setup  ## the exports in trainers' own loaders: Hugging Face datasets, torch, torchvision (installs 1.3 GB)
+interop: setup  ## the exports in trainers' own loaders: Hugging Face datasets, torch, torchvision, ultralytics (installs 1.5 GB)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[interop]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt --no-deps ultralytics ultralytics-thop polars polars-runtime-32  # its OpenCV would replace the headless one
 	$(BIN)/pytest tests/exports tests/dataset/test_card.py
 
 learn: setup  ## torch and what else the learning system needs, and its tests

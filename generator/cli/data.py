@@ -1,4 +1,4 @@
-"""Commands that exchange data with others: fetch, export coco and webdataset."""
+"""Commands that exchange data with others: fetch, and the exports."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from synthetless.cli.options import AsJson, Split
+from synthetless.cli.options import AsJson, Copy, Split
 from synthetless.cli.terminal import say
 
 FetchTo = Annotated[Path, typer.Option(metavar="DIR", help="Folder to put them into.")]
@@ -50,6 +50,9 @@ def coco_command(
     boxes: Annotated[
         Literal["visible", "amodal"], typer.Option(help="Around the visible pixels, or around the whole object.")
     ] = "visible",
+    polygons: Annotated[
+        bool, typer.Option("--polygons", help="Masks as polygons, for loaders that know no run lengths.")
+    ] = False,
     split: Split = None,
     as_json: AsJson = False,
 ) -> None:
@@ -61,7 +64,7 @@ def coco_command(
     from synthetless.exports.coco import export_coco
 
     with undisturbed(dataset, may_grow=True):
-        count = export_coco(dataset, to, split, boxes)
+        count = export_coco(dataset, to, split, boxes, polygons)
     say(json.dumps({"images": count, "file": str(to)}) if as_json else f"{count} images in {to}")
 
 
@@ -94,3 +97,31 @@ def webdataset_command(
     images, count = len(shards), len(set(shards.values()))
     answer = {"images": images, "shards": count, "folder": str(to)}
     say(json.dumps(answer) if as_json else f"{images} images in {count} shards in {to}")
+
+
+def yolo_command(
+    dataset: Annotated[Path, typer.Argument(help="The dataset's folder.")],
+    to: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")],
+    task: Annotated[
+        Literal["detect", "segment", "pose"], typer.Option(help="Boxes, outlines, or the 8 canonical box corners.")
+    ] = "detect",
+    amodal: Annotated[bool, typer.Option("--amodal", help="Of whole objects, hidden parts included.")] = False,
+    classes: Annotated[
+        Literal["object", "regressor"] | None,
+        typer.Option(help="What a class is; default: regressor for pose, else object."),
+    ] = None,
+    val_percent: Annotated[
+        int, typer.Option(min=0, max=50, metavar="PERCENT", help="Images to validate with, whole drops.")
+    ] = 10,
+    copy: Copy = False,
+    split: Split = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write the folder that ultralytics trains YOLO with."""
+    from synthetless.dataset.labels import undisturbed
+    from synthetless.exports.yolo import DATA_FILE, export_yolo
+
+    with undisturbed(dataset, may_grow=True):
+        export_yolo(dataset, to, task, split, amodal, classes, val_percent, copy)
+    file = to / DATA_FILE
+    say(json.dumps({"task": task, "file": str(file)}) if as_json else f"{task} labels: {file}")

@@ -91,7 +91,7 @@ def validate_command(
         typer.Option(
             "--export",
             metavar="PATH",
-            help="A COCO file or shards made from it; may be given several times.",
+            help="An export made from it, file or folder; may be given several times.",
         ),
     ] = None,
     limit: Annotated[int, typer.Option(min=1, metavar="N", help="How many faults of each kind to show.")] = 20,

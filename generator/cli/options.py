@@ -35,3 +35,4 @@ RecipeArgument = Annotated[
 ]
 Split = Annotated[str | None, typer.Option(metavar="NAME", help="Folder of images, where there are several.")]
 Workers = Annotated[int | None, typer.Option(min=1, metavar="N", help="Processes; default: one per core.")]
+Copy = Annotated[bool, typer.Option("--copy", help="Copy the dataset's files, for a folder to send; else links.")]

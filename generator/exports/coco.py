@@ -11,71 +11,31 @@ import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal, NotRequired
+from typing import Any, Literal, NotRequired
 
 from pycocotools import mask as coco_mask
-from pydantic import ConfigDict, Field, with_config
 from tqdm import tqdm
 from typing_extensions import TypedDict
 
 from synthetless.dataset.labels import BOX_EDGES, refuse_half_labelled
-from synthetless.dataset.layout import DATASET_FILE, ScenePaths, find_split, refuse_target, scene_ids
-from synthetless.dataset.reader import ImageEntries, read_entries
-from synthetless.dataset.records import Count, validated
+from synthetless.dataset.layout import ScenePaths, find_split, refuse_target, scene_ids
 from synthetless.errors import UserError
-from synthetless.io.files import atomic_file, read_json, remove_drafts
+from synthetless.exports.annotated import (
+    AnnotatedImage,
+    SceneAnnotation,
+    SceneCategory,
+    Segmentation,
+    annotated_images,
+    compressed_rle,
+    decoded_mask,
+    in_image,
+    licence_of,
+    read_scene_coco,
+)
+from synthetless.exports.outlines import border_polygons
+from synthetless.io.files import atomic_file, remove_drafts
 
 BoxKind = Literal["visible", "amodal"]
-
-_OPEN = ConfigDict(extra="ignore", strict=True)
-_Side = Annotated[int, Field(ge=1, le=2**20)]
-_Run = Annotated[int, Field(ge=0, le=2**31)]
-
-
-@with_config(_OPEN)
-class _Segmentation(TypedDict):
-    """Run lengths of a mask, plain or as pycocotools compresses them; ``size`` is [rows, columns]."""
-
-    counts: list[_Run] | str
-    size: Annotated[list[_Side], Field(min_length=2, max_length=2)]
-
-
-@with_config(_OPEN)
-class _SceneImage(TypedDict):
-    """An image in a scene folder's scene_gt_coco.json; BOP's scripts write more."""
-
-    id: Count
-    file_name: str
-    width: _Side
-    height: _Side
-
-
-@with_config(_OPEN)
-class _SceneAnnotation(TypedDict):
-    """A visible instance in it."""
-
-    image_id: Count
-    category_id: Count
-    area: Count
-    bbox: Annotated[list[float], Field(min_length=4, max_length=4)]
-    segmentation: _Segmentation
-    ignore: bool
-
-
-@with_config(_OPEN)
-class _SceneCategory(TypedDict):
-    """An object in it."""
-
-    id: Count
-
-
-@with_config(_OPEN)
-class _SceneFile(TypedDict):
-    """What is needed of scene_gt_coco.json."""
-
-    images: list[_SceneImage]
-    annotations: list[_SceneAnnotation]
-    categories: list[_SceneCategory]
 
 
 class ExportedImage(TypedDict):
@@ -115,7 +75,7 @@ class ExportedAnnotation(_QuasiFields):
     ignore: bool
     area: int
     bbox: list[float]
-    segmentation: _Segmentation
+    segmentation: Segmentation | list[list[int]]
     keypoints: list[float]
     num_keypoints: int
     gt_id: int
@@ -139,7 +99,9 @@ _BEGINNING = re.compile(rb'\{\n"info": \{"description": ".*", "version": "1\.0"\
 """How every file of ``export_coco`` begins."""
 
 
-def export_coco(dataset: Path, to: Path, split: str | None = None, boxes: BoxKind = "visible") -> int:
+def export_coco(
+    dataset: Path, to: Path, split: str | None = None, boxes: BoxKind = "visible", polygons: bool = False
+) -> int:
     """Write a split as one COCO file; images stay where they are and are named relative to it.
 
     Images are numbered from 1 through all scenes, annotations likewise. Instances of which nothing is visible are
@@ -150,6 +112,7 @@ def export_coco(dataset: Path, to: Path, split: str | None = None, boxes: BoxKin
         to: the JSON file to write; one that an earlier export wrote is replaced.
         split: folder name; the only one if None.
         boxes: of the visible part, or of the whole silhouette inside the image.
+        polygons: write masks as polygons, for readers that know no run lengths.
 
     Returns:
         The number of images.
@@ -163,22 +126,22 @@ def export_coco(dataset: Path, to: Path, split: str | None = None, boxes: BoxKin
     refuse_target(dataset, to)
     _refuse_others(to)
     to = to.resolve()
-    licence = _licence(dataset)
+    licence = licence_of(dataset)
     categories: dict[int, Any] = {}
     images: list[str] = []
     annotations: list[str] = []
     for scene_id in tqdm(scene_ids(dataset, split), desc="COCO", unit="scene", disable=None):
         scene = ScenePaths.of(dataset, scene_id, split)
-        coco: Any = read_json(scene.scene_gt_coco)  # as it stands there: categories may say more than is asked for
-        validated(_SceneFile, coco, scene.scene_gt_coco)
+        coco = read_scene_coco(scene)
         categories |= {category["id"]: _with_corners(category) for category in coco["categories"]}
-        for labels, image, visible in _by_image(scene, coco):
+        for image in annotated_images(scene, coco):
             image_id = len(images) + 1
-            exported = _image(image, image_id, scene_id, scene, labels, to)
+            exported = _image(image, image_id, scene_id, scene, to)
             images.append(json.dumps(exported if licence is None else exported | {"license": 1}))
-            for gt_id, annotation in visible:
+            for gt_id, annotation in image.visible:
                 number = len(annotations) + 1
-                annotations.append(json.dumps(_annotation(number, image_id, image, labels, gt_id, annotation, boxes)))
+                item = _annotation(number, image_id, image, gt_id, annotation, boxes, polygons)
+                annotations.append(json.dumps(item))
     head = {
         "info": {"description": f"{dataset.resolve().name} {split}", "version": "1.0"},
         "licenses": [] if licence is None else [{"id": 1, "name": licence, "url": ""}],
@@ -201,56 +164,29 @@ def _refuse_others(to: Path) -> None:
     raise UserError(f"{to}: exists already and is not a COCO export; give a new name")
 
 
-def _by_image(
-    scene: ScenePaths, coco: _SceneFile
-) -> Iterator[tuple[ImageEntries, _SceneImage, list[tuple[int, _SceneAnnotation]]]]:
-    """Each image's labels, its entry in scene_gt_coco.json, and gt_id and annotation of its visible instances.
-
-    BOP's annotations do not say which instance they belong to: they are in scene_gt's order, less the hidden ones.
-    """
-    images = {image["id"]: image for image in coco["images"]}
-    annotations: dict[int, list[_SceneAnnotation]] = {im_id: [] for im_id in images}
-    for annotation in coco["annotations"]:
-        if annotation["image_id"] not in images:
-            raise UserError(f"{scene.scene_gt_coco}: annotates image {annotation['image_id']}, which it does not list")
-        annotations[annotation["image_id"]].append(annotation)
-    for labels in read_entries(scene):
-        visible = [gt_id for gt_id, info in enumerate(labels.gt_info) if info["px_count_visib"] > 0]
-        found = annotations.get(labels.im_id, [])
-        if labels.im_id not in images or [a["category_id"] for a in found] != [
-            labels.gt[gt_id]["obj_id"] for gt_id in visible
-        ]:
-            raise UserError(
-                f"{scene.scene_gt_coco}: image {labels.im_id} does not list the {len(visible)} visible instances "
-                "of scene_gt.json in their order"
-            )
-        yield labels, images[labels.im_id], list(zip(visible, found, strict=True))
-
-
-def _image(
-    image: _SceneImage, image_id: int, scene_id: int, scene: ScenePaths, labels: ImageEntries, to: Path
-) -> ExportedImage:
-    path = os.path.relpath(scene.root / image["file_name"], to.parent)
+def _image(image: AnnotatedImage, image_id: int, scene_id: int, scene: ScenePaths, to: Path) -> ExportedImage:
+    path = os.path.relpath(scene.root / image.entry["file_name"], to.parent)
     return {
         "id": image_id,
         "file_name": Path(path).as_posix(),
-        "width": image["width"],
-        "height": image["height"],
+        "width": image.entry["width"],
+        "height": image.entry["height"],
         "scene_id": scene_id,
-        "im_id": labels.im_id,
-        "cam_K": labels.camera["cam_K"],
+        "im_id": image.labels.im_id,
+        "cam_K": image.labels.camera["cam_K"],
     }
 
 
 def _annotation(
     number: int,
     image_id: int,
-    image: _SceneImage,
-    labels: ImageEntries,
+    image: AnnotatedImage,
     gt_id: int,
-    annotation: _SceneAnnotation,
+    annotation: SceneAnnotation,
     boxes: BoxKind,
+    polygons: bool,
 ) -> ExportedAnnotation:
+    labels = image.labels
     gt, label = labels.gt[gt_id], labels.gt_canonical[gt_id]
     corners = label["bbox3d_corners_2d"]
     rle = compressed_rle(annotation["segmentation"])
@@ -263,8 +199,8 @@ def _annotation(
         "ignore": annotation["ignore"],
         "area": annotation["area"],
         "bbox": annotation["bbox"] if boxes == "amodal" else [int(side) for side in coco_mask.toBbox(rle)],
-        "segmentation": rle,
-        "keypoints": _keypoints(corners, image["width"], image["height"]),
+        "segmentation": polygons_of(rle) if polygons else rle,
+        "keypoints": _keypoints(corners, image.entry["width"], image.entry["height"]),
         "num_keypoints": len(corners),
         "gt_id": gt_id,
         "visib_fract": labels.gt_info[gt_id]["visib_fract"],
@@ -280,31 +216,24 @@ def _annotation(
     return exported | quasi  # type: ignore[no-any-return]
 
 
-def compressed_rle(segmentation: _Segmentation) -> _Segmentation:
-    """COCO's compressed run lengths, as text, of a segmentation in either form; by pycocotools."""
-    if isinstance(segmentation["counts"], str):
-        return segmentation
-    rle = coco_mask.frPyObjects(segmentation, *segmentation["size"])
-    return {"counts": rle["counts"].decode("ascii"), "size": [int(side) for side in rle["size"]]}
+def polygons_of(segmentation: Segmentation) -> list[list[int]]:
+    """COCO's polygons [[x, y, x, y, ...], ...] of run lengths; pycocotools makes the same mask of them.
+
+    Each connected piece is one polygon, holes included.
+    """
+    return [ring.ravel().tolist() for ring in border_polygons(decoded_mask(segmentation))]
 
 
 def _keypoints(corners: list[list[float]], width: int, height: int) -> list[float]:
-    """COCO's flat [u, v, flag, ...]; pixel (i, j) is centred at (i, j), so the image begins at -0.5."""
+    """COCO's flat [u, v, flag, ...]."""
     flat: list[float] = []
     for u, v in corners:
-        inside = -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5
-        flat += [u, v, _IN_IMAGE if inside else _OUTSIDE]
+        flat += [u, v, _IN_IMAGE if in_image(u, v, width, height) else _OUTSIDE]
     return flat
 
 
-def _with_corners(category: _SceneCategory) -> dict[str, Any]:
+def _with_corners(category: SceneCategory) -> dict[str, Any]:
     return {**category, "keypoints": _CORNER_NAMES, "skeleton": _SKELETON}
-
-
-def _licence(dataset: Path) -> str | None:
-    """What dataset.json says of the models' licence, if anything."""
-    path = dataset / DATASET_FILE
-    return (read_json(path).get("licence") or None) if path.exists() else None
 
 
 def _json_parts(head: dict[str, Any], lists: dict[str, list[str]]) -> Iterator[str]:

@@ -1,11 +1,11 @@
-"""Exports against the dataset they were made from: shards member by member, a COCO file by its ids."""
+"""Exports against the dataset they were made from: shards by members, a COCO file by ids, a folder by files."""
 
 from __future__ import annotations
 
 import json
 import tarfile
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,11 @@ from pycocotools import mask as coco_mask
 
 from synthetless.dataset.layout import AMBIGUITY_FILE, DATASET_FILE, SYMMETRIES_FILE, ScenePaths
 from synthetless.dataset.records import uncompressed_rle
-from synthetless.exports.coco import export_coco
+from synthetless.errors import UserError
+from synthetless.exports.coco import export_coco, polygons_of
+from synthetless.exports.folder import FolderExport, compare, owned_files, read_export
 from synthetless.exports.webdataset import KEYS_FILE
+from synthetless.exports.yolo import YoloExport
 from synthetless.io.files import read_bytes, read_json
 from synthetless.io.images import decode_mask
 from synthetless.validation.records import SceneRecords
@@ -222,6 +225,65 @@ def _check_keys(path: Path, numbers: Mapping[str, int]) -> Iterator[Finding]:
             yield Finding("export", path, message)
 
 
+# Folders
+
+FOLDER_EXPORTS: tuple[type[FolderExport], ...] = (YoloExport,)
+_FAULTS = {
+    "missing": "not there; export anew",
+    "differs": "is not what the dataset gives now: the export is older, or damaged; export anew",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FolderTask:
+    """What a worker is given: an export, its folder, and the part to compare; None for the files of the whole."""
+
+    export: FolderExport
+    folder: Path
+    part: Any
+    limit: int
+
+
+@dataclass(frozen=True, eq=False)
+class FolderPart:
+    """What a worker gives back: faults, and the names of the files that there should be."""
+
+    tally: Tally
+    names: frozenset[str]
+
+
+def folder_tasks(source: Source, folder: Path, limit: int) -> list[FolderTask]:
+    """The parts of an export that is a folder.
+
+    Raises:
+        UserError: it does not say what it was asked for, or the dataset cannot be exported.
+    """
+    export = read_export(folder, source.root, FOLDER_EXPORTS)
+    return [FolderTask(export, folder, part, limit) for part in (*export.parts(), None)]
+
+
+def check_folder(task: FolderTask) -> FolderPart:
+    """Compare the files of a part."""
+    tally = Tally(task.limit)
+    entries = task.export.common() if task.part is None else task.export.entries(task.part)
+    names = set()
+    try:
+        for name, fault in compare(task.folder, entries):
+            names.add(name)
+            if fault is not None:
+                tally.add([Finding("export", task.folder / name, _FAULTS[fault])])
+    except UserError as error:
+        tally.add([Finding("export", task.folder, f"cannot be compared, the dataset cannot be exported: {error}")])
+    return FolderPart(tally, frozenset(names))
+
+
+def check_owned(task: FolderTask, names: Set[str]) -> Iterator[Finding]:
+    """Files that are in no part of the dataset."""
+    for name in owned_files(task.export, task.folder):
+        if name not in names:
+            yield Finding("export", task.folder / name, "is of no image of the dataset; export anew")
+
+
 # COCO files
 
 
@@ -246,6 +308,7 @@ def check_coco_export(source: Source, path: Path) -> Iterator[Finding]:
         return
     _resolve(found["images"], path.parent)
     _choose_boxes(found["annotations"], expected["annotations"])
+    _choose_outlines(found["annotations"], expected["annotations"])
     for name in _LISTS:
         yield from _compare(path, name, found[name], expected[name])
 
@@ -270,6 +333,13 @@ def _choose_boxes(found: Mapping[int, Any], expected: Mapping[int, Any]) -> None
     if n_visible > n_amodal:
         for number, item in expected.items():
             item["bbox"] = visible[number]
+
+
+def _choose_outlines(found: Mapping[int, Any], expected: Mapping[int, Any]) -> None:
+    """Expect polygons instead of run lengths, if more of the masks found are polygons."""
+    if 2 * sum(isinstance(item.get("segmentation"), list) for item in found.values()) > len(found):
+        for item in expected.values():
+            item["segmentation"] = polygons_of(item["segmentation"])
 
 
 def _resolve(images: Mapping[int, dict[str, Any]], folder: Path) -> None:

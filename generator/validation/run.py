@@ -12,6 +12,7 @@ from synthetless.dataset.labels import undisturbed
 from synthetless.dataset.layout import DATASET_FILE, ImagePlan
 from synthetless.dataset.store import DatasetStore
 from synthetless.errors import UserError
+from synthetless.exports.folder import EXPORT_FILE, is_export
 from synthetless.io.parallel import Map, processes, watched
 from synthetless.validation.ambiguity import check_ambiguity
 from synthetless.validation.exports import (
@@ -20,7 +21,10 @@ from synthetless.validation.exports import (
     by_scene,
     check_coco_export,
     check_companions,
+    check_folder,
+    check_owned,
     check_shards,
+    folder_tasks,
 )
 from synthetless.validation.foreign import ForeignTask, check_foreign_scene, is_adopted, notes_on, read_foreign
 from synthetless.validation.images import can_decode_exr
@@ -32,7 +36,7 @@ from synthetless.validation.records import (
     check_stored,
     match_annotations,
 )
-from synthetless.validation.report import KINDS, Finding, Report, Tally
+from synthetless.validation.report import KINDS, Finding, Report, Tally, bare
 from synthetless.validation.structure import (
     Source,
     check_counts,
@@ -64,7 +68,7 @@ def validate(
     Args:
         dataset: its folder, as ``generate`` fills it, or as ``adopt`` leaves it.
         sample: how many images to recompute, evenly spread; None for every one.
-        exports: COCO files and folders of shards that were made from the dataset.
+        exports: COCO files, folders of shards and other exports that were made from the dataset.
         limit: how many faults of each kind to report in full; all are counted.
         workers: processes; one per available core if None.
 
@@ -105,7 +109,9 @@ def _validate_own(root: Path, sample: int | None, exports: tuple[Path, ...], lim
         images, instances = sum(len(s.image_ids) for s in scenes), sum(s.instances for s in scenes)
         tally.add(check_counts(root, header, images, instances))
         for export in exports:
-            if export.is_dir():
+            if is_export(export):
+                _check_folder(source, export, run, tally)
+            elif export.is_dir():
                 _check_shards(source, scenes, export, run, tally)
             else:
                 tally.add(check_coco_export(source, export))
@@ -137,9 +143,9 @@ def _require(root: Path, exports: Sequence[Path], limit: int) -> None:
         raise UserError(f"{root}: no {DATASET_FILE}; give a folder that generate filled, or that adopt labelled")
     for path in exports:
         if not path.exists():
-            raise UserError(f"{path}: no such export; give a COCO file or a folder of shards")
-        if path.is_dir() and not any(path.glob("shard-*.tar")):
-            raise UserError(f"{path}: holds no shards (shard-000000.tar, ...)")
+            raise UserError(f"{path}: no such export; give a COCO file or the folder of another export")
+        if path.is_dir() and not is_export(path) and not any(path.glob("shard-*.tar")):
+            raise UserError(f"{path}: is no export; it holds neither {EXPORT_FILE} nor shards (shard-000000.tar, ...)")
 
 
 # Scene folders
@@ -263,6 +269,19 @@ def _check_shards(source: Source, scenes: Sequence[SceneResult], folder: Path, r
     tasks = [ShardsTask(source, scene_id, folder, of, tally.limit) for scene_id, of in members.items()]
     for result in watched(run, check_shards, tasks, folder.name, "part"):
         tally.merge(result)
+
+
+def _check_folder(source: Source, folder: Path, run: Map, tally: Tally) -> None:
+    try:
+        tasks = folder_tasks(source, folder, tally.limit)
+    except UserError as error:
+        tally.add([Finding("export", folder / EXPORT_FILE, bare(error, folder / EXPORT_FILE))])
+        return
+    names: set[str] = set()
+    for result in watched(run, check_folder, tasks, folder.name, "part"):
+        tally.merge(result.tally)
+        names |= result.names
+    tally.add(check_owned(tasks[-1], names))
 
 
 # The report

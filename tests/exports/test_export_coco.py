@@ -227,3 +227,15 @@ def test_a_damaged_coco_file_is_one_line(damaged_copy: Path, tmp_path: Path, num
 def damaged_copy(dataset: Path, tmp_path: Path) -> Path:
     """A copy to damage, without pictures, which are not read."""
     return shutil.copytree(dataset, tmp_path / "copy", ignore=shutil.ignore_patterns("*.png"))
+
+
+def test_polygons_are_the_masks(dataset: Path, exported: Path, tmp_path: Path) -> None:
+    """pycocotools makes of them what it makes of the run lengths; nothing else is different."""
+    export_coco(dataset, tmp_path / "polygons.json", polygons=True)
+    with_runs, with_polygons = _load(exported), _load(tmp_path / "polygons.json")
+    assert len(with_polygons.anns) == len(with_runs.anns) > 12
+    for number, annotation in with_polygons.anns.items():
+        runs = with_runs.anns[number]
+        assert isinstance(annotation["segmentation"], list)
+        assert np.array_equal(with_polygons.annToMask(annotation), with_runs.annToMask(runs))
+        assert {**annotation, "segmentation": runs["segmentation"]} == runs

@@ -17,6 +17,7 @@ from trees import contents
 from synthetless.errors import UserError
 from synthetless.exports.coco import export_coco
 from synthetless.exports.webdataset import export_webdataset, relabel_webdataset
+from synthetless.exports.yolo import export_yolo
 from synthetless.io.files import atomic_folder
 
 Export = Callable[[Path, Path], object]
@@ -24,6 +25,7 @@ Export = Callable[[Path, Path], object]
 EXPORTS: dict[str, Export] = {
     "coco": export_coco,
     "webdataset": lambda dataset, to: export_webdataset(dataset, to, workers=1),
+    "yolo": lambda dataset, to: export_yolo(dataset, to, workers=1),
     "relabel": lambda dataset, to: relabel_webdataset(dataset, to, workers=1),
 }
 BELONGS = "belongs to the dataset|holds the dataset"

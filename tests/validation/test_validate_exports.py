@@ -12,9 +12,11 @@ from typing import Any
 
 import pytest
 from damage_kit import IMAGE, WHOLE, Victim
+from valid_dataset import small_scene_folders
 
 from synthetless.exports.coco import BoxKind, export_coco
 from synthetless.exports.webdataset import export_webdataset
+from synthetless.exports.yolo import export_yolo
 from synthetless.validation import validate
 
 KEY = f"000001_{IMAGE:06d}"
@@ -41,8 +43,10 @@ def test_exports_as_written_are_right(valid: Path, shards: Path, tmp_path: Path)
         exports.append(tmp_path / f"{boxes}.json")
         kind: BoxKind = "visible" if boxes == "visible" else "amodal"
         export_coco(valid, exports[-1], boxes=kind)
+    exports.append(tmp_path / "polygons.json")
+    export_coco(valid, exports[-1], polygons=True)
     report = validate(valid, exports=exports, workers=1)
-    assert report.lines() == [f"{valid}: 6 images, 6 of them recomputed, 34 instances, 3 exports: valid"]
+    assert report.lines() == [f"{valid}: 6 images, 6 of them recomputed, 34 instances, 4 exports: valid"]
 
 
 def test_workers_compare_shards_alike(valid: Path, shards: Path, tmp_path: Path) -> None:
@@ -201,6 +205,75 @@ def test_a_cut_coco_file_is_found(valid: Path, tmp_path: Path) -> None:
     export_coco(valid, path)
     path.write_bytes(path.read_bytes()[:-100])
     assert _places(valid, path) == [("unreadable", "coco.json", None, None)]
+
+
+def test_damage_to_polygons_is_found(valid: Path, tmp_path: Path) -> None:
+    path = tmp_path / "coco.json"
+    export_coco(valid, path, polygons=True)
+    with Victim(valid).json(path) as content:
+        content["annotations"][7]["segmentation"][0][0] += 1
+        content["annotations"][8]["segmentation"] = {"counts": [0, 96 * 128], "size": [96, 128]}
+    assert _places(valid, path) == [("export", "coco.json", 2, 1), ("export", "coco.json", 2, 2)]
+
+
+# --- folders ---
+
+
+@pytest.fixture(scope="module")
+def yolo(valid: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    to = tmp_path_factory.mktemp("exports") / "yolo"
+    with small_scene_folders():
+        export_yolo(valid, to, "pose", workers=1)
+    return to
+
+
+def test_a_folder_as_written_is_right(valid: Path, yolo: Path, tmp_path: Path) -> None:
+    """Also a copied one, one that is moved, and one into which ultralytics has put its cache."""
+    export_yolo(valid, tmp_path / "copied", "segment", amodal=True, copy=True, workers=1)
+    (tmp_path / "copied").rename(tmp_path / "moved")
+    (tmp_path / "moved" / "labels" / "train.cache").touch()
+    report = validate(valid, exports=[yolo, tmp_path / "moved"], workers=1)
+    assert report.lines() == [f"{valid}: 6 images, 6 of them recomputed, 34 instances, 2 exports: valid"]
+
+
+def _set_text(path: Path, text: str) -> None:
+    path.unlink()
+    path.write_text(text)
+
+
+FOLDER: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "missing label": (lambda f: (f / "labels/train/000001_000002.txt").unlink(), "000001_000002.txt"),
+    "stale label": (lambda f: _set_text(f / "labels/train/000001_000002.txt", "0 0.5 0.5 1 1"), "000001_000002.txt"),
+    "foreign label": (lambda f: (f / "labels/train/000009_000000.txt").touch(), "000009_000000.txt"),
+    "moved label": (
+        lambda f: (f / "labels/train/000001_000002.txt").rename(f / "labels/val/000001_000002.txt"),
+        "000001_000002.txt",
+    ),
+    "another picture": (lambda f: _set_text(f / "images/train/000001_000002.png", "?"), "000001_000002.png"),
+    "a link to nowhere": (
+        lambda f: (
+            _set_text(f / "images/train/000001_000002.png", "") or (f / "images/train/000001_000002.png").unlink()
+        ),
+        "000001_000002.png",
+    ),
+    "data.yaml": (lambda f: _set_text(f / "data.yaml", "names: [1]"), "data.yaml"),
+    "symmetries": (lambda f: _set_text(f / "symmetries.json", "{}"), "symmetries.json"),
+    "another request": (lambda f: _set_text(f / "export.json", '{"kind": "yolo"}'), "export.json"),
+    "a damaged request": (
+        lambda f: _set_text(f / "export.json", '{"kind": "yolo", "options": {"split": "s", "task": "fly"}}'),
+        "export.json",
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "file"), FOLDER.values(), ids=FOLDER.keys())
+def test_damage_to_a_folder_is_found(
+    valid: Path, yolo: Path, tmp_path: Path, change: Callable[[Path], Any], file: str
+) -> None:
+    folder = tmp_path / "yolo"
+    shutil.copytree(yolo, folder)
+    change(folder)
+    assert {("export", file, None, None)} == set(_places(valid, folder))
 
 
 def test_an_export_from_before_a_relabelling_is_found(valid: Path, shards: Path, tmp_path: Path) -> None:
