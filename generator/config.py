@@ -10,30 +10,42 @@ import difflib
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from synthetless import assets
 from synthetless.errors import UserError
 from synthetless.io.documents import parse_document, read_document, shown
 from synthetless.io.files import atomic_write
-from synthetless.scenes.settings import SENSORS, Bounds, RoomSettings, SceneSettings, SensorSettings, Settings
+from synthetless.scenes.settings import (
+    CONTAINERS,
+    SENSORS,
+    Bounds,
+    RoomSettings,
+    SceneSettings,
+    SensorSettings,
+    Settings,
+)
 from synthetless.scenes.spec import Intrinsics
 
 BUILTIN = "builtin"
 BUILTIN_MODELS = Path(assets.__file__).parent / "parts"
 BUILTIN_RECIPES = Path(__file__).parent / "configs"
 Tree = TypeVar("Tree", bound=Settings)
+DISTRACTORS = (2, 6)
+"""How many a scene has, if a recipe names their folder and says no more."""
 SPLIT = "train_synthetless"
 """The folder of scenes, if a recipe names no other."""
 
 _NAMED: Mapping[tuple[str, ...], Callable[[str], dict[str, Any]]] = {
     ("sensor",): lambda name: {} if name == "none" else {"preset": name},
     ("light", "room"): lambda _: {},
+    ("release", "container"): lambda name: deepcopy(CONTAINERS.get(name, {name: {}})),
 }
 """Groups of settings that may be given by name, and what a name stands for when an override changes one of them."""
 _NAMES: Mapping[type[Settings], tuple[str, ...]] = {
@@ -58,7 +70,8 @@ class SourceSettings(Settings):
     models: str = BUILTIN
     """BOP models folder (obj_000001.ply, ..., models_info.json), or builtin."""
     distractors: str | None = None
-    """BOP models folder of unlabelled objects."""
+    """BOP models folder of unlabelled objects, or builtin; gives each scene 2 to 6 of them, unless objects.distractors
+    says how many."""
     textures: str = BUILTIN
     """Folder of photographs for the table, or builtin."""
     licence: str = ""
@@ -104,6 +117,17 @@ class Recipe(SceneSettings):
     """How they are encoded."""
     labels: LabelSettings = Field(default_factory=LabelSettings)
     """Canonical poses."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_distractors(cls, given: Any) -> Any:
+        """A folder of distractors alone asks for some; written out, so that a stored recipe keeps its meaning."""
+        if not isinstance(given, dict) or not isinstance(source := given.get("source"), dict):
+            return given
+        objects = given.get("objects", {})
+        if source.get("distractors") is None or not isinstance(objects, dict) or "distractors" in objects:
+            return given
+        return {**given, "objects": {**objects, "distractors": DISTRACTORS}}
 
     @property
     def intrinsics(self) -> Intrinsics:
@@ -262,7 +286,7 @@ def _explain(error: ValidationError, kind: type[Settings]) -> str:
     key = ".".join(str(part) for part in fault["loc"])
     if fault["type"] == "extra_forbidden":
         known = [setting.key for setting in settings(kind)]
-        groups = sorted({".".join(k.split(".")[:-1]) for k in known} - {""})
+        groups = sorted({k[:end] for k in known for end, character in enumerate(k) if character == "."})
         return f"unknown setting {shown(key)[1:-1]}{_nearest(key, known + groups)}"
     value = fault["input"]
     detail = _EXPECTED.get(fault["type"]) or fault["msg"][0].lower() + fault["msg"][1:]

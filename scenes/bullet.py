@@ -77,6 +77,14 @@ class RigidWorld:
         box.rigid_body.friction = math.sqrt(friction)
         box.matrix_world = self._matrix(rotation, centre_m)
 
+    def add_fixed_hull(self, corners_m: Array, friction: float) -> None:
+        """A convex piece (n, 3), world frame, that never moves."""
+        centre = corners_m.mean(axis=0)  # Bullet is most exact about a shape's own origin
+        piece = self._add(corners_m - centre, "CONVEX_HULL")
+        piece.rigid_body.type = "PASSIVE"
+        piece.rigid_body.friction = math.sqrt(friction)
+        piece.matrix_world = self._matrix(np.eye(3), centre)
+
     def add_body(self, pieces_m: Sequence[Array], mass_kg: float, rotation: Array, position_m: Array) -> None:
         """A body made of convex pieces, whose origin is its mass centre.
 

@@ -7,6 +7,7 @@ could be touched from outside is far from the true surface.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +20,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from synthetless.errors import UserError
 from synthetless.scenes.contact import Surface
-from synthetless.scenes.spec import Mesh
+from synthetless.scenes.spec import Mesh, Standing
 
 Array = NDArray[np.float64]
 Remember = Callable[[Callable[[], dict[str, NDArray[Any]]]], Mapping[str, NDArray[Any]]]
@@ -33,6 +34,10 @@ HOLLOW_M = 0.002
 
 SIMPLIFY_M = 0.0002
 """Corners of a piece are dropped as long as nothing sticks out further than this."""
+
+_FEET_M, _STEADY_DEG, _FLATTER = (0.00005, 0.0005), 5.0, 1.2
+"""A face to stand on: of points this near the ground, on a smooth part or on a rough one; it takes this tilt to topple
+over its edges; and it is this much wider than what a ball as high has so near the ground."""
 
 _TRIED_POINTS, _TRIED_GAPS = 300, 300
 _KEPT_GAPS = 5000
@@ -80,6 +85,29 @@ def collider(mesh: Mesh, remember: Remember = lambda compute: compute()) -> Coll
     body = remember(lambda: _convex_body(surface))
     pieces = tuple(np.split(body["pieces_m"], np.cumsum(body["piece_sizes"])[:-1]))
     return Collider(surface, pieces, body["hull_m"], body["mass_centre_m"], float(body["volume_m3"]))
+
+
+def standing(item: Collider) -> Standing | None:
+    """How a body stands upright, z up if it can; None if it stands neither that way up nor the other."""
+    points = item.surface.vertices_m
+    for upside_down in (False, True):
+        z, sign = (-points[:, 2], -1.0) if upside_down else (points[:, 2], 1.0)
+        centre_m = float(sign * item.mass_centre_m[2] - z.min())
+        for near_m in _FEET_M:
+            foot = points[z < z.min() + near_m][:, :2] - item.mass_centre_m[:2]
+            ball_m = math.sqrt(2 * near_m * centre_m)
+            if _reach(foot) >= max(centre_m * math.tan(math.radians(_STEADY_DEG)), _FLATTER * ball_m):
+                radius = float(np.linalg.norm(points[:, :2], axis=1).max())
+                return Standing(upside_down, -float(z.min()), float(np.ptp(z)), radius)
+    return None
+
+
+def _reach(points: Array) -> float:
+    """Distance from the origin to the border of the convex hull of (N, 2) points; negative if it lies outside."""
+    try:
+        return float(-ConvexHull(points).equations[:, 2].max())
+    except (QhullError, ValueError):  # too few points, or all in one line
+        return -math.inf
 
 
 def _convex_body(surface: Surface) -> dict[str, NDArray[Any]]:

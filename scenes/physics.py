@@ -1,8 +1,9 @@
 """Objects fall onto the table, collide and come to rest: Blender's rigid bodies, judged on the true meshes.
 
-Two acts. First the convex hulls fall between invisible frictionless walls that keep them together. Then the walls are
-gone and the objects, now as tight-fitting convex pieces, settle into what they touch. A throw counts only if the true
-meshes pass: at rest, on the table, nothing floating, nothing inside something else.
+Two acts. First the convex hulls fall between invisible frictionless walls that keep them together: a tube, or the sides
+of the container, made thicker and higher. Then those walls are gone and the objects, now as tight-fitting convex
+pieces, settle into what they touch; the container stays as it is. A throw counts only if the true meshes pass: at rest,
+on the table, nothing floating, nothing inside something else.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from synthetless.scenes.bullet import RigidWorld
 from synthetless.scenes.collider import Collider, collider
-from synthetless.scenes.contact import Contacts, Posed, measure
+from synthetless.scenes.contact import Contacts, Posed, Surface, measure
+from synthetless.scenes.container import container_mesh, container_pieces, turn
 from synthetless.scenes.rotations import matrix
-from synthetless.scenes.spec import Pose
+from synthetless.scenes.spec import ContainerSpec, Pose
 
 __all__ = ["Collider", "NotSettled", "PhysicsSettings", "Settled", "collider", "settle"]
 
@@ -84,7 +86,7 @@ class Settled:
 
     Attributes:
         poses: model to world.
-        gaps_m: distance of each true mesh to the nearest thing it touches, table or object.
+        gaps_m: distance of each true mesh to the nearest thing it touches: table, container or object.
         penetrations_m: how deep each true mesh and another thing are inside one another, at most.
     """
 
@@ -101,15 +103,22 @@ class _Bodies:
     centres_m: Array
 
 
-def settle(colliders: Sequence[Collider], release: Sequence[Pose], settings: PhysicsSettings) -> Settled:
+def settle(
+    colliders: Sequence[Collider],
+    release: Sequence[Pose],
+    settings: PhysicsSettings,
+    container: ContainerSpec | None = None,
+) -> Settled:
     """Let objects fall from their release poses until they rest.
 
     The result depends on the arguments alone, bit for bit. Blender's data is left as it was found.
 
     Args:
         colliders: one per object; an object drawn twice has the same one twice.
-        release: where each is let go, model to world, above the table z = 0 and apart from each other.
+        release: where each is let go, model to world, above the table z = 0 and apart from each other; above a
+            container they are moved inwards as far as needed to fall into it.
         settings: how they fall, and when they count as at rest.
+        container: what they fall into.
 
     Raises:
         NotSettled: they do not come to rest, or not acceptably.
@@ -117,18 +126,22 @@ def settle(colliders: Sequence[Collider], release: Sequence[Pose], settings: Phy
     if not colliders:
         return Settled((), (), ())
     bodies = _released(colliders, release)
-    bodies, _ = _simulate(colliders, bodies, settings, walls=True)
-    bodies, moved = _simulate(colliders, bodies, settings, walls=False)
+    if container is not None:
+        bodies = _above(container, colliders, bodies)
+    bodies, _ = _simulate(colliders, bodies, settings, container, walls=True)
+    bodies, moved = _simulate(colliders, bodies, settings, container, walls=False)
     _check_place(bodies, settings)
     _check_stillness(moved, settings)
     placed = [
         Posed(item.surface, rotation, centre - rotation @ item.mass_centre_m)
         for item, rotation, centre in zip(colliders, bodies.rotations, bodies.centres_m, strict=True)
     ]
-    contacts = measure(placed, 2 * settings.max_gap_m)
-    _check_penetration(contacts, settings)
-    _check_support(contacts, settings)
     n = len(placed)
+    fixed = [] if container is None else [Posed(Surface(container_mesh(container)), np.eye(3), np.zeros(3))]
+    contacts = measure([*placed, *fixed], 2 * settings.max_gap_m)
+    names = [*(f"object {number}" for number in range(n)), *("the container" for _ in fixed), "the table"]
+    _check_penetration(contacts, names, settings)
+    _check_support(contacts, names, settings)
     return Settled(
         poses=tuple(_pose(item) for item in placed),
         gaps_m=tuple(contacts.gap_m[:n].min(axis=1).tolist()),
@@ -143,6 +156,24 @@ def _released(colliders: Sequence[Collider], release: Sequence[Pose]) -> _Bodies
     return _Bodies(rotations, np.array(centres).reshape(-1, 3))
 
 
+def _above(container: ContainerSpec, colliders: Sequence[Collider], bodies: _Bodies) -> _Bodies:
+    """Bodies moved along the table until each is between the sides of the floor.
+
+    Raises:
+        NotSettled: one is too large for that.
+    """
+    along = turn(container)
+    half = np.array(container.floor_m) / 2
+    centres = bodies.centres_m @ along
+    for number, (item, rotation) in enumerate(zip(colliders, bodies.rotations, strict=True)):
+        corners = (item.hull_m @ (along.T @ rotation).T)[:, :2]
+        low, high = -half - corners.min(axis=0), half - corners.max(axis=0)
+        if (low > high).any():
+            raise NotSettled(f"object {number} does not fit into the container")
+        centres[number, :2] = np.clip(centres[number, :2], low, high)
+    return _Bodies(bodies.rotations, centres @ along.T)
+
+
 def _pose(placed: Posed) -> Pose:
     x, y, z, w = Rotation.from_matrix(placed.rotation).as_quat(canonical=True).tolist()
     px, py, pz = placed.position_m.tolist()
@@ -150,7 +181,11 @@ def _pose(placed: Posed) -> Pose:
 
 
 def _simulate(
-    colliders: Sequence[Collider], start: _Bodies, settings: PhysicsSettings, walls: bool
+    colliders: Sequence[Collider],
+    start: _Bodies,
+    settings: PhysicsSettings,
+    container: ContainerSpec | None,
+    walls: bool,
 ) -> tuple[_Bodies, Array]:
     """Run until still or out of time. Returns the bodies and how far each moved in the last moments, metres."""
     with RigidWorld(
@@ -166,7 +201,9 @@ def _simulate(
     ) as world:
         half = np.array([10 * settings.table_radius_m, 10 * settings.table_radius_m, _THICKNESS_M])
         world.add_fixed_box(half, np.eye(3), np.array([0, 0, -_THICKNESS_M]), settings.friction)
-        if walls:
+        if container is not None:
+            _add_container(world, container, settings, (start.centres_m[:, 2].max() if walls else None))
+        elif walls:
             _add_walls(world, colliders, start, settings)
         for item, rotation, centre in zip(colliders, start.rotations, start.centres_m, strict=True):
             mass = settings.density_kg_m3 * item.volume_m3
@@ -205,6 +242,28 @@ def _add_walls(world: RigidWorld, colliders: Sequence[Collider], start: _Bodies,
         world.add_fixed_box(half, rotation, rotation[:, 0] * (radius + _THICKNESS_M), friction=0.0)
 
 
+def _add_container(
+    world: RigidWorld, container: ContainerSpec, settings: PhysicsSettings, chute_m: float | None
+) -> None:
+    """The container itself; or, while objects fall into it, its floor between walls of the given height.
+
+    What falls fast could pass through thin sides and floors: those walls are thick, and the floor is as thick as the
+    table.
+    """
+    if chute_m is None:
+        for piece in container_pieces(container):
+            world.add_fixed_hull(piece, settings.friction)
+        return
+    along, half = turn(container), np.array(container.floor_m) / 2
+    reach = half + 2 * _THICKNESS_M
+    below = np.array([0, 0, container.wall_m - _THICKNESS_M])
+    world.add_fixed_box(np.array([*reach, _THICKNESS_M]), along, below, settings.friction)
+    for axis, side in ((0, -1), (0, 1), (1, -1), (1, 1)):
+        size, centre = np.array([*reach, 2 * chute_m]), np.zeros(3)
+        size[axis], centre[axis] = _THICKNESS_M, side * (half[axis] + _THICKNESS_M)
+        world.add_fixed_box(size, along, along @ centre, friction=0.0)
+
+
 def _check_place(bodies: _Bodies, settings: PhysicsSettings) -> None:
     for number, (x, y, z) in enumerate(bodies.centres_m.tolist()):
         if z < 0:
@@ -221,16 +280,15 @@ def _check_stillness(moved: Array, settings: PhysicsSettings) -> None:
         )
 
 
-def _check_penetration(contacts: Contacts, settings: PhysicsSettings) -> None:
+def _check_penetration(contacts: Contacts, names: Sequence[str], settings: PhysicsSettings) -> None:
     i, j = np.unravel_index(contacts.penetration_m.argmax(), contacts.penetration_m.shape)
-    depth, table = contacts.penetration_m[i, j], len(contacts.gap_m) - 1
+    depth = contacts.penetration_m[i, j]
     if depth > settings.max_penetration_m:
         first, second = sorted((int(i), int(j)))
-        other = "the table" if second == table else f"object {second}"
-        raise NotSettled(f"object {first} penetrates {other} by {depth * _MM:.1f} mm")
+        raise NotSettled(f"{names[first]} penetrates {names[second]} by {depth * _MM:.1f} mm")
 
 
-def _check_support(contacts: Contacts, settings: PhysicsSettings) -> None:
+def _check_support(contacts: Contacts, names: Sequence[str], settings: PhysicsSettings) -> None:
     """Everything must be connected to the table through contacts."""
     table = len(contacts.gap_m) - 1
     touches = contacts.gap_m <= settings.max_gap_m
@@ -242,4 +300,4 @@ def _check_support(contacts: Contacts, settings: PhysicsSettings) -> None:
         number = int(np.flatnonzero(~supported)[0])
         gap = contacts.gap_m[number].min()
         far = f"{gap * _MM:.1f} mm" if np.isfinite(gap) else f"more than {2 * settings.max_gap_m * _MM:.1f} mm"
-        raise NotSettled(f"object {number} floats: {far} from what is nearest to it")
+        raise NotSettled(f"{names[number]} floats: {far} from what is nearest to it")

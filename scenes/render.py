@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from synthetless.errors import UserError
 from synthetless.scenes import blender, camera, lights, materials
 from synthetless.scenes.blender import RenderDevice
+from synthetless.scenes.container import container_mesh
 from synthetless.scenes.rotations import matrix
 from synthetless.scenes.settings import RenderSettings, TableSettings
 from synthetless.scenes.spec import Intrinsics, Mesh, Pose, Role, SceneSpec
@@ -79,6 +80,10 @@ class BlenderSession:
             if spec.room is not None:
                 lights.add_room(self.bpy, collection, spec.room, spec.ambient, centre_m)
             self._add_table(collection, spec, centre_m)
+            if spec.container is not None:
+                container = self.bpy.data.objects.new("container", _load_mesh(self.bpy, container_mesh(spec.container)))
+                container.data.materials[0] = materials.plastic(self.bpy, spec.container.material)
+                collection.objects.link(container)
             for number, (item, pose) in enumerate(zip(spec.objects, settled, strict=True)):
                 placed = self.bpy.data.objects.new(f"object {number}", self._mesh(item.role, item.obj_id))
                 placed.matrix_world = _transform(pose)

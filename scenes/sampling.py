@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
 
+from synthetless.scenes.container import turn
 from synthetless.scenes.rotations import random_rotation
 from synthetless.scenes.settings import (
+    BoxSettings,
     CameraSettings,
+    ContainerSettings,
     FloatRange,
     LightSettings,
     ObjectSettings,
@@ -28,15 +31,19 @@ from synthetless.scenes.settings import (
 from synthetless.scenes.spec import (
     AmbientLight,
     AreaLight,
+    ContainerKind,
+    ContainerSpec,
     Material,
     ObjectSpec,
     PlaneSpec,
     PointLight,
     Pose,
+    Quaternion,
     Role,
     RoomSpec,
     SceneSpec,
     SensorSpec,
+    Standing,
     Vector,
     View,
 )
@@ -59,6 +66,8 @@ class Stream(IntEnum):
     SENSOR = 6
     METALLIC = 7
     ROOM = 8
+    CONTAINER = 9
+    UPRIGHT = 10
 
 
 @dataclass(frozen=True)
@@ -69,11 +78,13 @@ class Catalogue:
         models: diameter in metres of each labelled model, by object id.
         distractors: the same of the unlabelled ones.
         photos: names of the photographs for the table; empty means the built-in textures.
+        standing: how each labelled model stands, where objects are to be set down upright.
     """
 
     models: Mapping[int, float]
     distractors: Mapping[int, float]
     photos: Sequence[str] = ()
+    standing: Mapping[int, Standing] = field(default_factory=dict)
 
 
 def sample_scene(settings: SceneSettings, catalogue: Catalogue, seed: int, drop: int, attempt: int = 0) -> SceneSpec:
@@ -96,7 +107,9 @@ def sample_scene(settings: SceneSettings, catalogue: Catalogue, seed: int, drop:
     chosen = _choose_objects(settings.objects, catalogue, stream(Stream.OBJECTS))
     materials, metallic = stream(Stream.MATERIALS), stream(Stream.METALLIC)
     diameters = [(catalogue.models if role == "model" else catalogue.distractors)[i] for role, i in chosen]
-    releases = _release(settings.release, diameters, stream(Stream.RELEASE, attempt))
+    container = sample_container(settings.release.container, seed, drop)
+    upright = _set_down(settings.release, catalogue, chosen, container, stream(Stream.UPRIGHT, attempt))
+    releases = _release(settings.release, diameters, upright, container, stream(Stream.RELEASE, attempt))
     objects = tuple(
         ObjectSpec(role, obj_id, _material(settings.objects, materials, metallic), pose)
         for (role, obj_id), pose in zip(chosen, releases, strict=True)
@@ -107,7 +120,7 @@ def sample_scene(settings: SceneSettings, catalogue: Catalogue, seed: int, drop:
     )
     plane = _plane(settings.table, catalogue.photos, stream(Stream.PLANE))
     room = sample_room(settings.light.room, seed, drop)
-    return SceneSpec(drop, attempt, objects, plane, light, ambient, views, room)
+    return SceneSpec(drop, attempt, objects, plane, light, ambient, views, room, container)
 
 
 def sample_room(settings: RoomSettings | None, seed: int, drop: int) -> RoomSpec | None:
@@ -132,6 +145,30 @@ def ceiling_share(side_m: float, height_m: float) -> float:
     ratio = side_m / 2 / height_m
     slope = ratio / math.sqrt(1 + ratio * ratio)
     return 4 / math.pi * slope * math.atan(slope)
+
+
+def sample_container(settings: ContainerSettings, seed: int, drop: int) -> ContainerSpec | None:
+    """Draw what the objects of a drop are poured into, if anything; arguments as for ``sample_scene``."""
+    rng = _stream(seed, drop, Stream.CONTAINER)
+    of_kind: tuple[tuple[ContainerKind, BoxSettings], ...] = (("box", settings.box), ("tray", settings.tray))
+    drawn, reached = float(rng.uniform()), 0.0
+    for kind, asked in of_kind:
+        reached += asked.share
+        if drawn < reached:
+            return _container(kind, asked, rng)
+    return None
+
+
+def _container(kind: ContainerKind, settings: BoxSettings, rng: np.random.Generator) -> ContainerSpec:
+    return ContainerSpec(
+        kind=kind,
+        floor_m=(_uniform(rng, settings.sides_m), _uniform(rng, settings.sides_m)),
+        height_m=_uniform(rng, settings.height_m),
+        wall_m=_uniform(rng, settings.wall_m),
+        slope_deg=_uniform(rng, settings.slope_deg),
+        rotation_deg=float(rng.uniform(0, 360)),
+        material=Material(_colour(settings.grey, settings.tint, "displayed", rng), float(rng.uniform(0.4, 0.9)), 0.3),
+    )
 
 
 def sample_sensor(settings: SensorSettings, seed: int, drop: int, view: int) -> SensorSpec:
@@ -186,24 +223,114 @@ def _choose_objects(settings: ObjectSettings, catalogue: Catalogue, rng: np.rand
 
 
 def _material(settings: ObjectSettings, rng: np.random.Generator, metallic: np.random.Generator) -> Material:
-    grey = _uniform(rng, settings.grey)
-    deviations = rng.uniform(-settings.tint, settings.tint, size=3)
-    channels = (min(max(grey + d, 0.0), 1.0) for d in deviations.tolist())
-    red, green, blue = channels if settings.grey_scale == "linear" else map(linear_from_srgb, channels)
+    albedo = _colour(settings.grey, settings.tint, settings.grey_scale, rng)
     roughness, specular = _uniform(rng, settings.roughness), _uniform(rng, settings.specular)
-    return Material((red, green, blue), roughness, specular, _uniform(metallic, settings.metallic))
+    return Material(albedo, roughness, specular, _uniform(metallic, settings.metallic))
 
 
-def _release(settings: ReleaseSettings, diameters_m: Sequence[float], rng: np.random.Generator) -> list[Pose]:
-    """One above the other, bounding spheres apart, spread over a disc."""
-    poses, floor = [], 0.0
-    for diameter in diameters_m:
+def _colour(grey: FloatRange, tint: float, scale: str, rng: np.random.Generator) -> Vector:
+    """Linear colour of a grey whose channels deviate; both on a linear scale, or as displayed."""
+    drawn = _uniform(rng, grey)
+    deviations = rng.uniform(-tint, tint, size=3)
+    channels = (min(max(drawn + d, 0.0), 1.0) for d in deviations.tolist())
+    red, green, blue = channels if scale == "linear" else map(linear_from_srgb, channels)
+    return (red, green, blue)
+
+
+def _release(
+    settings: ReleaseSettings,
+    diameters_m: Sequence[float],
+    upright: Mapping[int, tuple[Pose, float]],
+    container: ContainerSpec | None,
+    rng: np.random.Generator,
+) -> list[Pose]:
+    """One above the other, bounding spheres apart, spread over a disc or a container's floor.
+
+    Those that are set down, by number, are given with their height; the others are poured over them.
+    """
+    poses = []
+    floor = max((top for _, top in upright.values()), default=0.0 if container is None else container.wall_m)
+    for number, diameter in enumerate(diameters_m):
         rotation = random_rotation(rng)
-        radius, angle = settings.spread_m * math.sqrt(rng.uniform()), rng.uniform(0, 2 * math.pi)
-        height = floor + _uniform(rng, settings.clearance_m) + diameter / 2
+        share, turned = float(rng.uniform()), float(rng.uniform())
+        clearance = _uniform(rng, settings.clearance_m)
+        if number in upright:
+            poses.append(upright[number][0])
+            continue
+        if container is None:
+            radius, angle = settings.spread_m * math.sqrt(share), turned * 2 * math.pi
+            x, y = radius * math.cos(angle), radius * math.sin(angle)
+        else:
+            x, y = _on_floor(container, diameter / 2, (share, turned))
+        height = floor + clearance + diameter / 2
         floor = height + diameter / 2
-        poses.append(Pose(rotation, (radius * math.cos(angle), radius * math.sin(angle), height)))
+        poses.append(Pose(rotation, (x, y, height)))
     return poses
+
+
+def _on_floor(container: ContainerSpec, radius_m: float, shares: tuple[float, float]) -> tuple[float, float]:
+    """The point at some share of each of the floor's sides, where a circle of some radius stays on the floor."""
+    along = [
+        (share - 0.5) * max(side - 2 * radius_m, 0.0) for share, side in zip(shares, container.floor_m, strict=True)
+    ]
+    x, y = (turn(container)[:2, :2] @ along).tolist()
+    return x, y
+
+
+_SET_DOWN_M, _APART_M = 0.001, 0.005
+"""From how high objects are set down, and how far from each other at least."""
+_PLACES = 100
+"""So many places are tried for an object that is set down."""
+
+
+def _set_down(
+    settings: ReleaseSettings,
+    catalogue: Catalogue,
+    chosen: Sequence[tuple[Role, int]],
+    container: ContainerSpec | None,
+    rng: np.random.Generator,
+) -> dict[int, tuple[Pose, float]]:
+    """Poses of the objects that are set down upright, by number, and the height that each reaches.
+
+    They are apart from each other; those that find no room on a container's floor are left out.
+    """
+    placed: dict[int, tuple[Pose, float]] = {}
+    circles: list[tuple[float, float, float]] = []
+    ground = 0.0 if container is None else container.wall_m
+    for number, (role, obj_id) in enumerate(chosen):
+        if role != "model" or float(rng.uniform()) >= settings.upright:
+            continue
+        stands = catalogue.standing[obj_id]
+        half_turn = float(rng.uniform(0, math.pi))
+        circle = _free_place(stands.radius_m, circles, settings.spread_m, container, rng)
+        if circle is None:
+            continue
+        circles.append(circle)
+        cos, sin = math.cos(half_turn), math.sin(half_turn)
+        rotation: Quaternion = (0.0, cos, sin, 0.0) if stands.upside_down else (cos, 0.0, 0.0, sin)
+        foot = ground + _SET_DOWN_M
+        placed[number] = Pose(rotation, (*circle[:2], foot + stands.origin_m)), foot + stands.height_m
+    return placed
+
+
+def _free_place(
+    radius_m: float,
+    taken: Sequence[tuple[float, float, float]],
+    spread_m: float,
+    container: ContainerSpec | None,
+    rng: np.random.Generator,
+) -> tuple[float, float, float] | None:
+    """A circle (x, y, radius) apart from the taken ones: on a disc that grows until there is room, or on the floor."""
+    for attempt in range(_PLACES):
+        shares = float(rng.uniform()), float(rng.uniform())
+        if container is None:
+            reach = spread_m * math.sqrt(shares[0]) * 1.1**attempt
+            x, y = reach * math.cos(2 * math.pi * shares[1]), reach * math.sin(2 * math.pi * shares[1])
+        else:
+            x, y = _on_floor(container, radius_m, shares)
+        if all(math.hypot(x - u, y - v) >= radius_m + other + _APART_M for u, v, other in taken):
+            return x, y, radius_m
+    return None
 
 
 def _plane(settings: TableSettings, photos: Sequence[str], rng: np.random.Generator) -> PlaneSpec:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, GetCoreSchemaHandler, model_validator
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
@@ -75,6 +75,81 @@ class ObjectSettings(Settings):
     """Unlabelled objects per scene from the distractors folder; they are rendered and occlude."""
 
 
+class BoxSettings(Settings):
+    """An open box that objects are poured into."""
+
+    share: Annotated[float, Bounds(0, 1)] = 0.0
+    """Share of the drops that have one; `release.container: box` is short for 1."""
+    sides_m: Annotated[FloatRange, Bounds(0.02, 5, "m")] = (0.22, 0.32)
+    """Length and width of its floor, inside, each drawn; no smaller than the largest object's diameter."""
+    height_m: Annotated[FloatRange, Bounds(0.01, 2, "m")] = (0.05, 0.12)
+    """Height of its rim above the table."""
+    wall_m: Annotated[FloatRange, Bounds(0.001, 0.1, "m")] = (0.006, 0.01)
+    """Thickness of its sides and floor."""
+    slope_deg: Annotated[FloatRange, Bounds(0, 60, "deg")] = (0.0, 5.0)
+    """How far its sides lean outwards."""
+    grey: Annotated[FloatRange, Bounds(0, 1, "sRGB")] = (0.15, 0.85)
+    """Its grey, as displayed."""
+    tint: Annotated[float, Bounds(0, 1)] = 0.15
+    """Largest deviation of a colour channel from the grey, as displayed."""
+
+    @model_validator(mode="after")
+    def _has_room(self) -> Self:
+        if self.wall_m[1] >= self.height_m[0]:
+            raise PydanticCustomError(
+                "walls",
+                "a floor of up to {wall} m (wall_m) fills a container that is {height} m high (height_m)",
+                {"wall": self.wall_m[1], "height": self.height_m[0]},
+            )
+        return self
+
+
+class TraySettings(BoxSettings):
+    """A wide and low one with leaning sides."""
+
+    share: Annotated[float, Bounds(0, 1)] = 0.0
+    """Share of the drops that have one; `release.container: tray` is short for 1."""
+    sides_m: Annotated[FloatRange, Bounds(0.02, 5, "m")] = (0.28, 0.42)
+    """Length and width of its floor, inside, each drawn; no smaller than the largest object's diameter."""
+    height_m: Annotated[FloatRange, Bounds(0.01, 2, "m")] = (0.025, 0.05)
+    """Height of its rim above the table."""
+    slope_deg: Annotated[FloatRange, Bounds(0, 60, "deg")] = (10.0, 35.0)
+    """How far its sides lean outwards."""
+
+
+CONTAINERS: dict[str, dict[str, Any]] = {"none": {}, "box": {"box": {"share": 1.0}}, "tray": {"tray": {"share": 1.0}}}
+"""What the names of containers stand for."""
+
+
+class ContainerSettings(Settings):
+    """What objects are poured into: nothing, or what the shares say."""
+
+    box: BoxSettings = Field(default_factory=BoxSettings)
+    """With high sides."""
+    tray: TraySettings = Field(default_factory=TraySettings)
+    """With low ones."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_name(cls, given: Any) -> Any:
+        if not isinstance(given, str):
+            return given
+        if given not in CONTAINERS:
+            names = ", ".join(CONTAINERS)
+            raise PydanticCustomError("container", "unknown container; give {names}", {"names": names})
+        return CONTAINERS[given]
+
+    @model_validator(mode="after")
+    def _are_shares(self) -> Self:
+        if self.box.share + self.tray.share > 1:
+            raise PydanticCustomError(
+                "shares",
+                "the shares of box and tray add up to {total}; at most 1",
+                {"total": self.box.share + self.tray.share},
+            )
+        return self
+
+
 class ReleaseSettings(Settings):
     """How objects are let go above the table, and when they count as at rest."""
 
@@ -84,6 +159,14 @@ class ReleaseSettings(Settings):
     """Vertical gap between the bounding spheres of one object and the next."""
     max_throws: Annotated[int, Bounds(1, 1000, "throws")] = 20
     """A drop that does not come to rest is thrown again, at most this often altogether."""
+    crowding: Annotated[float, Bounds(0.1, 10)] = 0.7
+    """Radius of the invisible tube in which objects fall, in units of the root of their summed squared radii; it is
+    never narrower than the objects need that are released over spread_m."""
+    upright: Annotated[float, Bounds(0, 1)] = 0.0
+    """Share of the labelled objects that are set down, apart from each other, on the face across their z axis: z up,
+    or down if they would not stand that way up. The others are poured over them."""
+    container: ContainerSettings = Field(default_factory=ContainerSettings)
+    """What the others are poured into."""
 
 
 class CameraSettings(Settings):

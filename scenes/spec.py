@@ -17,6 +17,7 @@ from synthetless.scenes.textures import PhotoTexture, ProceduralTexture
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Role = Literal["model", "distractor"]
+ContainerKind = Literal["box", "tray"]
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,29 @@ class ObjectSpec:
     obj_id: int
     material: Material
     release: Pose
+
+
+@dataclass(frozen=True)
+class ContainerSpec:
+    """What the objects lie in: an open box whose middle is the world's origin. It occludes, but gets no label.
+
+    Attributes:
+        kind: what it was drawn as.
+        floor_m: length and width of its floor, inside.
+        height_m: of the rim above the table.
+        wall_m: thickness of the floor, and of the sides, measured along the table.
+        slope_deg: how far the sides lean outwards.
+        rotation_deg: of its length, about +z from +x.
+        material: what it is made of.
+    """
+
+    kind: ContainerKind
+    floor_m: tuple[float, float]
+    height_m: float
+    wall_m: float
+    slope_deg: float
+    rotation_deg: float
+    material: Material
 
 
 @dataclass(frozen=True)
@@ -146,7 +170,7 @@ class SceneSpec:
     """One drop: everything that is decided before physics and rendering begin.
 
     ``attempt`` counts the throws that did not come to rest before this one; only the release poses differ
-    between attempts.
+    between attempts. A record leaves ``container`` out where there is none.
     """
 
     drop: int
@@ -157,6 +181,7 @@ class SceneSpec:
     ambient: AmbientLight
     views: tuple[View, ...]
     room: RoomSpec | None = None
+    container: ContainerSpec | None = None
 
 
 def plain(spec: Any) -> Any:
@@ -216,6 +241,23 @@ class Intrinsics:
     fy: float
     cx: float
     cy: float
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A model that stands upright: with its z axis up, or down.
+
+    Attributes:
+        upside_down: whether z points down.
+        origin_m: height of the model's origin above what it stands on.
+        height_m: of the model.
+        radius_m: of the circle about its origin, seen from above, that holds it.
+    """
+
+    upside_down: bool
+    origin_m: float
+    height_m: float
+    radius_m: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -129,6 +129,55 @@ def _leaves(tree: dict[str, object], prefix: str = "") -> list[str]:
     return leaves
 
 
+def test_a_container_is_named_or_drawn_by_share() -> None:
+    def shares(*overrides: str) -> tuple[float, float]:
+        container = load_recipe(None, overrides).release.container
+        return container.box.share, container.tray.share
+
+    assert shares() == shares("release.container=none") == (0, 0)
+    assert shares("release.container=box") == (1, 0)
+    assert shares("release.container=box", "release.container.box.share=0.3", "release.container.tray.share=0.7") == (
+        0.3,
+        0.7,
+    )
+    assert shares("release.container=tray") == (0, 1), "what was set before is not kept"
+    recipe = load_recipe(None, ["release.container=tray"])
+    assert Recipe.model_validate(dump_recipe(recipe)) == recipe
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        (["release.container=crate"], "release.container = 'crate': unknown container; give none, box, tray"),
+        (
+            ["release.container.crate.share=1"],
+            "unknown setting release.container.crate; did you mean release.container",
+        ),
+        (
+            ["release.container=tray", "release.container.box.share=0.5"],
+            "shares of box and tray add up to 1.5; at most 1",
+        ),
+        (["release.container.box.sides_m=[0.3, 0.2]"], "min 0.3 is greater than max 0.2; write [min, max]"),
+        (["release.container.box.height_m=[0.01, 0.2]"], "0.01 m (wall_m) fills a container that is 0.01 m high"),
+        (["release.upright=[0, 1]"], "release.upright = [0, 1]"),
+        (["release.crowding=0"], "release.crowding = 0: 0.0 is outside 0.1..10"),
+    ],
+)
+def test_a_wrong_release_is_told_in_one_line(overrides: list[str], expected: str) -> None:
+    with pytest.raises(RecipeError) as error:
+        load_recipe(None, overrides)
+    assert expected in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_folder_of_distractors_alone_asks_for_some() -> None:
+    assert load_recipe(None, ["source.distractors=others"]).objects.distractors == (2, 6)
+    assert load_recipe(None, ["source.distractors=others", "objects.count=[1, 2]"]).objects.distractors == (2, 6)
+    assert load_recipe(None, ["source.distractors=others", "objects.distractors=[1, 1]"]).objects.distractors == (1, 1)
+    assert load_recipe(None).objects.distractors == (0, 0)
+    stored = dump_recipe(Recipe()) | {"source": {"distractors": "others"}}
+    assert Recipe.model_validate(stored).objects.distractors == (0, 0), "a stored recipe keeps its meaning"
+
+
 def test_a_quality_sets_what_is_not_given() -> None:
     draft, standard = load_recipe(None, ["render.quality=draft"]).render, load_recipe(None).render
     assert draft.samples < standard.samples < load_recipe(None, ["render.quality=reference"]).render.samples

@@ -340,7 +340,7 @@ class RayCaster:
         camera: Intrinsics,
         plane: Plane | None,
         instances: Sequence[PosedModel],
-        occluders: Sequence[PosedModel] = (),
+        occluders: Sequence[PosedModel | PosedSurface] = (),
         visibility_delta_mm: float = 0.0,
         normals: bool = False,
         object_coordinates: bool = False,
@@ -375,11 +375,21 @@ class RayCaster:
             object_coordinates_mm=scene.object_coordinates_mm(len(instances)) if object_coordinates else None,
         )
 
-    def pose(self, posed: PosedModel) -> PosedSurface:
+    def pose(self, posed: PosedModel | PosedSurface) -> PosedSurface:
         """A mesh in front of the camera; errors as in ``annotate``."""
+        if isinstance(posed, PosedSurface):
+            return posed
         return PosedSurface.of(self._surface(posed.key), posed.R_m2c, posed.t_m2c)
 
-    def _cast(self, camera: Intrinsics, posed: PosedModel, limits: Window) -> _Hits:
+    def unnamed(self, vertices_mm: ArrayLike, faces: ArrayLike) -> Surface:
+        """The surface of a mesh that is not one of the caster's, to be posed as an occluder.
+
+        Raises:
+            UserError: it is unusable.
+        """
+        return Surface(self._device, vertices_mm, faces)
+
+    def _cast(self, camera: Intrinsics, posed: PosedModel | PosedSurface, limits: Window) -> _Hits:
         body = self.pose(posed)
         window = limits.intersection(body.window(camera))
         faces = body.first_faces(Rays.through(camera, window))

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synthetless.annotation.instances import ImageAnnotation, MeshKey, PosedModel
-from synthetless.annotation.raycast import Plane, RayCaster
+from synthetless.annotation.raycast import Plane, PosedSurface, RayCaster
 from synthetless.config import Recipe
 from synthetless.io.images import has_depth
 from synthetless.io.models import ObjectModel
 from synthetless.scenes.camera import extrinsics, settled_centre
+from synthetless.scenes.container import container_mesh
 from synthetless.scenes.rotations import matrix
 from synthetless.scenes.spec import Pose, Role, SceneSpec
 
@@ -69,11 +70,12 @@ def annotate_scene(
         for item, pose in zip(scene.objects, settled, strict=True)
     ]
     labelled = [number for number, model in enumerate(posed) if model.role == "model"]
+    distractors = [model for model in posed if model.role != "model"]
     image = caster.annotate(
         recipe.intrinsics,
         Plane(R_w2c, t_w2c, recipe.table.size_m * MM_PER_M / 2),
         [posed[number] for number in labelled],
-        [model for model in posed if model.role != "model"],
+        [*distractors, *container_surfaces(caster, scene, R_w2c, t_w2c)],
         recipe.labels.visibility_delta_mm,
         "normals" in recipe.outputs,
         "object_coordinates" in recipe.outputs,
@@ -83,6 +85,16 @@ def annotate_scene(
     inside = [n for n, instance in enumerate(image.instances) if instance.mask.any()]
     numbers = tuple(labelled[n] for n in inside)
     return AnnotatedScene(R_w2c, t_w2c, tuple(posed[n] for n in numbers), numbers, image.restricted(inside))
+
+
+def container_surfaces(
+    caster: RayCaster, scene: SceneSpec, R_w2c: NDArray[np.float64], t_w2c: NDArray[np.float64]
+) -> list[PosedSurface]:
+    """What a scene's objects lie in, if anything, in front of a camera (mm); it hides, but is not labelled."""
+    if scene.container is None:
+        return []
+    mesh = container_mesh(scene.container)
+    return [PosedSurface.of(caster.unnamed(mesh.vertices_m * MM_PER_M, mesh.faces), R_w2c, t_w2c)]
 
 
 def model_to_camera(

@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 
 from synthetless.annotation.instances import PosedModel
-from synthetless.annotation.raycast import Plane, RayCaster
-from synthetless.annotation.scene import MM_PER_M, model_to_camera, scene_caster
+from synthetless.annotation.raycast import Plane, PosedSurface, RayCaster
+from synthetless.annotation.scene import MM_PER_M, container_surfaces, model_to_camera, scene_caster
 from synthetless.config import models_folder
 from synthetless.dataset.labels import refuse_half_labelled
 from synthetless.dataset.layout import (
@@ -326,23 +326,28 @@ def see_images(source: AmbiguitySource, scene: Scene, numbers: Sequence[int]) ->
 
 def _surroundings(
     source: AmbiguitySource, scene: Scene, number: int, spec: ImageSpec | None
-) -> tuple[Plane | None, list[PosedModel]]:
-    """The table and the distractors of an image of ours; of other images neither is known."""
+) -> tuple[Plane | None, list[PosedModel | PosedSurface]]:
+    """The table, the distractors and the container of an image of ours; of other images none is known."""
     if source.table_half_mm is None or scene.R_w2c is None or scene.t_w2c is None:
         return None, []
     R_w2c, t_w2c = scene.R_w2c[number], scene.t_w2c[number]
-    unlabelled = []
+    unlabelled: list[PosedModel | PosedSurface] = []
     if spec is not None:
         unlabelled = [
             PosedModel(item.obj_id, *model_to_camera(pose, R_w2c, t_w2c), item.role)
             for item, pose in zip(spec.scene.objects, spec.settled, strict=True)
             if item.role != "model"
         ]
+        unlabelled += container_surfaces(_caster(source.meshes), spec.scene, R_w2c, t_w2c)
     return Plane(R_w2c, t_w2c, source.table_half_mm), unlabelled
 
 
 def _entry(
-    source: AmbiguitySource, camera: Intrinsics, body: PosedModel, others: list[PosedModel], plane: Plane | None
+    source: AmbiguitySource,
+    camera: Intrinsics,
+    body: PosedModel,
+    others: list[PosedModel | PosedSurface],
+    plane: Plane | None,
 ) -> AmbiguityEntry:
     table, entry = source.table, source.table.entries[body.obj_id]
     canonical_map = table.quasi_map(body.obj_id)

@@ -200,6 +200,7 @@ def _making(recipe: Recipe) -> str:
         ("camera", f"{_span(camera.distance_m)} m away, {_span(camera.elevation_deg)}° above the table"),
         ("views of a drop", str(camera.views_per_drop)),
         ("objects in a drop", f"{_span(objects.count)}, and {_span(objects.distractors)} distractors"),
+        *_containers(recipe),
         ("models", "built-in parts" if recipe.source.models == BUILTIN else "CAD models, see the licence below"),
         ("grey of the objects", _span(objects.grey)),
         ("table", "procedural textures" if recipe.source.textures == BUILTIN else "photographs"),
@@ -209,6 +210,13 @@ def _making(recipe: Recipe) -> str:
         ("samples a pixel", f"{recipe.render.samples}, denoiser {recipe.render.denoiser}"),
     ]
     return f"## How it was made\n\n{_table(('setting', 'value'), rows)}\n\nThe whole recipe is in `dataset.json`."
+
+
+def _containers(recipe: Recipe) -> list[tuple[str, str]]:
+    of = recipe.release.container
+    kinds = (("box", of.box), ("tray", of.tray))
+    named = [f"{asked.share:.0%} of the drops in a {kind}" for kind, asked in kinds if asked.share > 0]
+    return [("containers", ", ".join(named))] if named else []
 
 
 def _visibility(delta_mm: float) -> str:

@@ -6,8 +6,7 @@ One DropRenderer per process: it holds the Blender session, the meshes and their
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from synthetless.annotation.scene import annotate_scene, scene_caster
@@ -15,11 +14,10 @@ from synthetless.config import Recipe
 from synthetless.dataset.layout import ImagePlan
 from synthetless.dataset.store import FinishedImage
 from synthetless.generation.progress import COLLIDERS, DROPPING, RENDERING, Report, Stage, unreported
-from synthetless.generation.sources import Sources
-from synthetless.io.cache import Cache, digest
-from synthetless.io.models import ObjectModel
+from synthetless.generation.sources import Sources, cached_collider
+from synthetless.io.cache import Cache
 from synthetless.scenes.blender import CPU, RenderDevice
-from synthetless.scenes.collider import VERSION, Collider, collider
+from synthetless.scenes.collider import Collider
 from synthetless.scenes.physics import NotSettled, PhysicsSettings, settle
 from synthetless.scenes.render import BlenderScene, BlenderSession
 from synthetless.scenes.sampling import sample_scene
@@ -57,14 +55,13 @@ class DropRenderer:
             device: what to render on.
             log: file that takes Blender's console output.
         """
-        by_role: dict[Role, Mapping[int, ObjectModel]] = {"model": sources.models, "distractor": sources.distractors}
-        models = {(role, obj_id): model for role, of in by_role.items() for obj_id, model in of.items()}
+        models = {(role, obj_id): model for role, of in sources.by_role.items() for obj_id, model in of.items()}
         self._recipe = recipe
         self._catalogue = sources.catalogue
         self._meshes = {key: Mesh(model.vertices_mm / _MM, model.faces) for key, model in models.items()}
         self._colliders: dict[ModelKey, Collider] = {}
         self._cache = Cache.default()
-        self._caster = scene_caster(by_role)
+        self._caster = scene_caster(sources.by_role)
         self.session = BlenderSession(
             self._meshes,
             recipe.intrinsics,
@@ -105,13 +102,15 @@ class DropRenderer:
             DropFailed: not within the recipe's number of throws.
         """
         throws = self._recipe.release.max_throws
+        physics = PhysicsSettings(crowding=self._recipe.release.crowding)
         reason = ""
         for attempt in range(throws):
             spec = sample_scene(self._recipe, self._catalogue, self._recipe.seed, drop, attempt)
             try:
                 colliders = self._colliders_of(spec, report)
                 report(Stage(DROPPING, f"again, throw {attempt + 1}" if attempt else ""))
-                return spec, settle(colliders, [item.release for item in spec.objects], PhysicsSettings()).poses
+                releases = [item.release for item in spec.objects]
+                return spec, settle(colliders, releases, physics, spec.container).poses
             except NotSettled as failure:
                 reason = str(failure)
         raise DropFailed(f"did not come to rest in {throws} throws; the last time, {reason}")
@@ -126,9 +125,7 @@ class DropRenderer:
 
     def _collider(self, key: ModelKey) -> Collider:
         if key not in self._colliders:
-            mesh = self._meshes[key]
-            content = digest(mesh.vertices_m, mesh.faces)
-            self._colliders[key] = collider(mesh, partial(self._cache.arrays, "collider", content, VERSION))
+            self._colliders[key] = cached_collider(self._meshes[key], self._cache)
         return self._colliders[key]
 
     def _image(self, plan: ImagePlan, scene: BlenderScene, settled: Sequence[Pose]) -> FinishedImage:

@@ -94,7 +94,7 @@ def generate(recipe: Recipe, out: Path, execution: Execution, tell: Tell = silen
     """
     tracker = Tracker(tell)
     tracker.phase(READING)
-    sources = load_sources(recipe)
+    sources = load_sources(recipe, tracker)
     if not (out / DATASET_FILE).exists():
         check_photos(sources, tracker)
         make_folder(out)

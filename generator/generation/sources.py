@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from synthetless.config import BUILTIN, Recipe, RecipeError, models_folder
 from synthetless.errors import UserError
 from synthetless.generation.progress import Tracker
+from synthetless.io.cache import Cache, digest
 from synthetless.io.models import ObjectModel, load_models
+from synthetless.scenes.collider import VERSION, Collider, collider, standing
 from synthetless.scenes.sampling import Catalogue
+from synthetless.scenes.settings import BoxSettings
+from synthetless.scenes.spec import Mesh, Role, Standing
 from synthetless.scenes.textures import list_photos, load_photo
 from synthetless.symmetry import SymmetryGroup
 
@@ -28,12 +34,19 @@ class Sources:
         distractors: unlabelled ones.
         photos: names of the photographs for the table, relative to ``photos_folder``; empty for built-in textures.
         photos_folder: where they are.
+        standing: how each labelled model stands, if the recipe sets objects down.
     """
 
     models: Mapping[int, ObjectModel]
     distractors: Mapping[int, ObjectModel]
     photos: tuple[str, ...]
     photos_folder: Path | None
+    standing: Mapping[int, Standing] = field(default_factory=dict)
+
+    @property
+    def by_role(self) -> dict[Role, Mapping[int, ObjectModel]]:
+        """All models, by role and object id."""
+        return {"model": self.models, "distractor": self.distractors}
 
     @property
     def catalogue(self) -> Catalogue:
@@ -42,7 +55,7 @@ class Sources:
         def diameters(models: Mapping[int, ObjectModel]) -> dict[int, float]:
             return {obj_id: model.diameter_mm / 1000 for obj_id, model in models.items()}
 
-        return Catalogue(diameters(self.models), diameters(self.distractors), self.photos)
+        return Catalogue(diameters(self.models), diameters(self.distractors), self.photos, self.standing)
 
     @property
     def scenery_digest(self) -> str:
@@ -53,8 +66,8 @@ class Sources:
         return hashlib.sha256("\n".join(listing).encode()).hexdigest()
 
 
-def load_sources(recipe: Recipe) -> Sources:
-    """Find and check the recipe's models, distractors and photographs.
+def load_sources(recipe: Recipe, tracker: Tracker | None = None) -> Sources:
+    """Find and check the recipe's models, distractors and photographs; the tracker is told what takes long.
 
     Raises:
         UserError: one of them is missing or cannot be used.
@@ -70,10 +83,62 @@ def load_sources(recipe: Recipe) -> Sources:
                 f"objects.distractors = {list(recipe.objects.distractors)} needs source.distractors, a models folder"
             )
         distractors = load_models(models_folder(recipe.source.distractors))
+    _check_containers(recipe, models, distractors)
+    stands = _standing(models, tracker) if recipe.release.upright > 0 else {}
     if recipe.source.textures == BUILTIN:
-        return Sources(models, distractors, (), None)
+        return Sources(models, distractors, (), None, stands)
     folder = Path(recipe.source.textures)
-    return Sources(models, distractors, list_photos(folder), folder)
+    return Sources(models, distractors, list_photos(folder), folder, stands)
+
+
+def cached_collider(mesh: Mesh, cache: Cache) -> Collider:
+    """A mesh as physics sees it, from the cache if it was made before.
+
+    Raises:
+        UserError: the mesh is flat.
+    """
+    return collider(mesh, partial(cache.arrays, "collider", digest(mesh.vertices_m, mesh.faces), VERSION))
+
+
+def _standing(models: Mapping[int, ObjectModel], tracker: Tracker | None) -> dict[int, Standing]:
+    cache, stands = Cache.default(), {}
+    for number, (obj_id, model) in enumerate(models.items(), start=1):
+        if tracker is not None:
+            tracker.phase("standing models up", f"{number} of {len(models)}")
+        found = standing(cached_collider(Mesh(model.vertices_mm / 1000, model.faces), cache))
+        if found is None:
+            raise RecipeError(
+                f"release.upright: {model.path.name} has no stable face across its z axis to be set down on; "
+                "choose others with objects.ids, or turn its model"
+            )
+        stands[obj_id] = found
+    return stands
+
+
+def _containers(recipe: Recipe) -> Iterator[tuple[str, BoxSettings]]:
+    """The containers that the recipe asks for, with the names of their settings."""
+    containers = recipe.release.container
+    for kind, asked in (("box", containers.box), ("tray", containers.tray)):
+        if asked.share > 0:
+            yield f"release.container.{kind}", asked
+
+
+def _check_containers(recipe: Recipe, *offered: Mapping[int, ObjectModel]) -> None:
+    """Every object must fit between the sides, and sides must hide what lies against them."""
+    largest = max((model for models in offered for model in models.values()), key=lambda model: model.diameter_mm)
+    delta_mm = recipe.labels.visibility_delta_mm
+    for name, asked in _containers(recipe):
+        if 1000 * asked.sides_m[0] < largest.diameter_mm:
+            raise RecipeError(
+                f"{name}.sides_m = {list(asked.sides_m)}: {largest.path.name} has a diameter of "
+                f"{largest.diameter_mm:.0f} mm and would not fit; give at least {largest.diameter_mm / 1000 + 5e-4:.3f}"
+            )
+        wall_mm = 1000 * asked.wall_m[0] * math.cos(math.radians(asked.slope_deg[1]))
+        if wall_mm <= delta_mm:
+            raise RecipeError(
+                f"{name}.wall_m = {list(asked.wall_m)}: labels.visibility_delta_mm = {delta_mm:g} counts as visible "
+                f"what is behind sides as thin as {wall_mm:.1f} mm; give thicker ones, or a smaller delta"
+            )
 
 
 def _check_room(recipe: Recipe) -> None:

@@ -13,7 +13,7 @@ from scipy import stats
 
 from synthetless.config import BUILTIN, Recipe
 from synthetless.scenes.sampling import lamp_warmth
-from synthetless.scenes.settings import RoomSettings
+from synthetless.scenes.settings import ContainerSettings, RoomSettings
 from synthetless.scenes.spec import ObjectSpec, RoomSpec, SceneSpec, View
 from synthetless.scenes.srgb import srgb_from_linear
 from synthetless.scenes.textures import FAMILIES, PhotoTexture
@@ -138,6 +138,8 @@ def _objects(seen: Observations, recipe: Recipe) -> Iterator[Distribution]:
     named = {str(n): dropped[n] for n in sizes}
     weights = {str(n): float(low <= n <= high) for n in sizes}
     yield _categories("objects_per_drop", "objects", "Objects dropped", named, weights, f"each of {low} to {high}")
+    if recipe.release.container != ContainerSettings():
+        yield _containers(seen, recipe)
     yield _release(items)
     if recipe.objects.tint == 0:
         linear = np.array([item.material.albedo[0] for item in items])
@@ -151,9 +153,22 @@ def _objects(seen: Observations, recipe: Recipe) -> Iterator[Distribution]:
         yield _uniform("object_metallic", "objects", "Metallic share of the objects", metallic, recipe.objects.metallic)
 
 
+def _containers(seen: Observations, recipe: Recipe) -> Distribution:
+    asked = recipe.release.container
+    none = round(1 - asked.box.share - asked.tray.share, 12)
+    weights = {"none": none, "box": asked.box.share, "tray": asked.tray.share}
+    found = Counter("none" if spec.container is None else spec.container.kind for spec in seen.drops)
+    named = {kind: found[kind] for kind in weights}
+    return _categories("containers", "objects", "What drops lie in", named, weights, "the shares of the recipe")
+
+
 def _release(items: Sequence[ObjectSpec]) -> Distribution:
-    """Angles of rotations uniform on SO(3) have the density (1 - cos a) / pi; the test is of the rotations."""
-    wxyz = np.array([item.release.rotation_wxyz for item in items])
+    """Angles of rotations uniform on SO(3) have the density (1 - cos a) / pi; the test is of the rotations.
+
+    Objects that were set down are left out: they are turned about z alone, or upside down.
+    """
+    wxyz = np.array([item.release.rotation_wxyz for item in items]).reshape(-1, 4)
+    wxyz = wxyz[~((wxyz[:, [1, 2]] == 0).all(axis=1) | (wxyz[:, [0, 3]] == 0).all(axis=1))]
     angle_deg = np.degrees(2 * np.arccos(np.clip(np.abs(wxyz[:, 0]), 0, 1)))
     edges = np.linspace(0, 180, _BINS + 1)
     share = np.diff(np.radians(edges) - np.sin(np.radians(edges))) / np.pi

@@ -370,7 +370,7 @@ def see(
     posed: PosedModel,
     R_canonical: Floats,
     cosets: Cosets,
-    others: Sequence[PosedModel] = (),
+    others: Sequence[PosedModel | PosedSurface] = (),
     plane: Plane | None = None,
     resolution: Resolution = Resolution(),
 ) -> Ambiguity:

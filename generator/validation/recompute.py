@@ -43,7 +43,8 @@ from synthetless.io.images import (
 )
 from synthetless.io.models import load_models
 from synthetless.scenes.camera import extrinsics, settled_centre
-from synthetless.scenes.sampling import sample_room
+from synthetless.scenes.sampling import sample_container, sample_room
+from synthetless.scenes.spec import ContainerSpec
 from synthetless.symmetry import SymmetryTable
 from synthetless.validation.images import (
     EXACT,
@@ -73,6 +74,8 @@ _ANOTHER_MACHINE = Tolerance(share=1e-3, px=2, box_px=1)
 """So many pixels of a mask may be on the other side of its edge in another machine's single precision ..."""
 _IN_AN_IMAGE = Tolerance(share=1e-4, px=2)
 """... and so many of a whole image."""
+_LARGEST_M = 100.0
+"""No container is larger."""
 
 
 # Cameras and poses: without rays
@@ -91,6 +94,9 @@ def check_specs(source: Source, scene: SceneRecords, plans: Sequence[ImagePlan])
             yield Finding("spec", path, "records another sensor than the recipe draws for this image", im_id)
         if spec.scene.room != sample_room(source.recipe.light.room, source.recipe.seed, spec.scene.drop):
             yield Finding("spec", path, "records another room than the recipe draws for this drop", im_id)
+        containers = source.recipe.release.container
+        if spec.scene.container != sample_container(containers, source.recipe.seed, spec.scene.drop):
+            yield Finding("spec", path, "records another container than the recipe draws for this drop", im_id)
         fault = incoherence(spec)
         if fault:
             yield Finding("spec", path, fault, im_id)
@@ -112,7 +118,16 @@ def incoherence(spec: ImageSpec) -> str | None:
     numbers = [value for pose in settled for value in (*pose.rotation_wxyz, *pose.position_m)]
     if not np.isfinite(numbers).all() or any(not any(pose.rotation_wxyz) for pose in settled):
         return "has a settled pose that is no rotation and position of finite numbers"
-    return None
+    return _container_fault(spec.scene.container)
+
+
+def _container_fault(container: ContainerSpec | None) -> str | None:
+    if container is None:
+        return None
+    lengths_m = (*container.floor_m, container.height_m, container.wall_m)
+    if all(0 < length < _LARGEST_M for length in lengths_m) and 0 <= container.slope_deg < 90:
+        return None
+    return f"has a container with the sizes {lengths_m} m and the slope {container.slope_deg} degrees"
 
 
 def _check_cameras(recipe: Recipe, scene: SceneRecords) -> Iterator[Finding]:

@@ -73,6 +73,12 @@ def _without_faces(inputs: Path) -> None:
     trimesh.PointCloud(trimesh.creation.box((30, 20, 10)).vertices).export(inputs / "models" / "obj_000001.ply")
 
 
+def _ball(inputs: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=10)
+    ball.export(inputs / "models" / "obj_000001.ply")
+    (inputs / "models" / "models_info.json").write_text(json.dumps({"1": {"diameter": 20.0}}))
+
+
 def _truncate(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -112,6 +118,21 @@ BAD_INPUT: dict[str, tuple[Callable[[Path], object], list[str], list[str]]] = {
         lambda i: None,
         ["--set", "objects.distractors=[1, 2]"],
         ["objects.distractors", "source.distractors"],
+    ),
+    "sides too small": (
+        lambda i: None,
+        ["--set", "release.container=box", "--set", "release.container.box.sides_m=[0.03, 0.2]"],
+        ["release.container.box.sides_m = [0.03, 0.2]", "obj_000001.ply", "37 mm", "give at least 0.038"],
+    ),
+    "sides thinner than what counts as visible": (
+        lambda i: None,
+        ["--set", "release.container=tray", "--set", "release.container.tray.wall_m=[0.002, 0.01]"],
+        ["release.container.tray.wall_m", "labels.visibility_delta_mm = 5", "1.6 mm"],
+    ),
+    "upright without a face to stand on": (
+        _ball,
+        ["--set", "release.upright=0.5"],
+        ["release.upright", "obj_000001.ply", "no stable face", "objects.ids"],
     ),
     "no images": (lambda i: None, ["--images", "0"], ["images", "0"]),
     "no such option": (lambda i: None, ["--imagse", "3"], ["--imagse", "--images"]),

@@ -23,9 +23,11 @@ from synthetless.dataset.layout import ScenePaths
 from synthetless.dataset.reader import read_recipe, read_specs
 from synthetless.generation.executors import FAULT_VARIABLE
 from synthetless.generation.generate import Execution, generate
+from synthetless.generation.rerender import render_again
 from synthetless.io.cache import CACHE_VARIABLE
 from synthetless.io.files import read_json
 from synthetless.io.models import load_models
+from synthetless.scenes.rotations import matrix
 from synthetless.scenes.spec import Intrinsics
 from synthetless.validation import validate
 
@@ -217,6 +219,19 @@ def test_an_image_is_rendered_again_from_its_record(dataset: Path, tmp_path: Pat
         timeout=300,
     )
     np.testing.assert_array_equal(cv2.imread(str(target)), cv2.imread(str(ScenePaths.of(dataset, 1).rgb(3))))
+
+
+def test_a_drop_into_a_box_is_upright_valid_and_rendered_again(recipe: Path, tmp_path: Path) -> None:
+    overrides = ["release.container=box", "release.container.box.sides_m=[0.25, 0.25]", "release.upright=1"]
+    overrides += ["objects.ids=[2, 3]", "objects.count=[3, 3]", "camera.elevation_deg=[60, 70]", "images=1"]
+    generate(load_recipe(recipe, overrides), tmp_path / "d", Execution(workers=1))
+    (image,) = read_specs(ScenePaths.of(tmp_path / "d", 1)).values()
+    assert image.scene.container is not None and image.scene.container.kind == "box"
+    assert min(matrix(pose.rotation_wxyz)[2, 2] for pose in image.settled) > np.cos(np.radians(3))
+    stored = cv2.imread(str(ScenePaths.of(tmp_path / "d", 1).rgb(0)))[..., ::-1]
+    np.testing.assert_array_equal(render_again(tmp_path / "d", 1, 0), stored)
+    report = validate(tmp_path / "d", workers=1)
+    assert report.valid and report.recomputed_images == 1, report.lines()
 
 
 def test_images_are_neither_black_nor_blown_out_nor_empty(dataset: Path) -> None:

@@ -17,11 +17,12 @@ import pytest
 import trimesh
 
 from synthetless.io.cache import Cache, digest
-from synthetless.scenes.collider import VERSION
+from synthetless.scenes.collider import VERSION, standing
 from synthetless.scenes.contact import Posed, Surface, measure
+from synthetless.scenes.container import container_mesh, container_pieces, turn
 from synthetless.scenes.physics import Collider, NotSettled, PhysicsSettings, Settled, collider, settle
 from synthetless.scenes.rotations import matrix, random_rotation
-from synthetless.scenes.spec import Mesh, Pose
+from synthetless.scenes.spec import ContainerKind, ContainerSpec, Material, Mesh, Pose
 
 bpy = pytest.importorskip("bpy", exc_type=ImportError)
 pytestmark = pytest.mark.blender
@@ -136,6 +137,70 @@ def test_nothing_thrown_is_nothing_settled() -> None:
 def test_simple_shapes_rest(shapes: list[Part], seed: int) -> None:
     parts = shapes + shapes[::-1]
     assert_rests(parts, drop(parts, seed))
+
+
+def container(kind: ContainerKind, height_m: float, slope_deg: float) -> ContainerSpec:
+    return ContainerSpec(kind, (0.16, 0.13), height_m, 0.006, slope_deg, 25.0, Material((0.5, 0.5, 0.5), 0.5, 0.0))
+
+
+@pytest.mark.parametrize("slope_deg", [0.0, 33.0])
+def test_a_container_is_closed_and_the_union_of_its_pieces(slope_deg: float) -> None:
+    spec = container("tray", 0.05, slope_deg)
+    mesh = container_mesh(spec)
+    surface = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
+    assert surface.is_watertight and surface.is_winding_consistent
+    pieces = [trimesh.convex.convex_hull(piece) for piece in container_pieces(spec)]
+    assert surface.volume == pytest.approx(sum(piece.volume for piece in pieces), rel=1e-9)
+    assert surface.bounds[:, 2].tolist() == [0.0, 0.05]
+    inside = mesh.vertices_m[12:] @ turn(spec)
+    np.testing.assert_allclose(np.ptp(inside, axis=0), (0.16, 0.13, 0), atol=1e-12)
+    np.testing.assert_allclose(inside[:, 2], 0.006)
+
+
+@pytest.mark.parametrize(("kind", "height_m", "slope_deg"), [("box", 0.1, 3.0), ("tray", 0.03, 30.0)])
+def test_shapes_rest_in_a_container(shapes: list[Part], kind: ContainerKind, height_m: float, slope_deg: float) -> None:
+    """By exact geometry: nothing within its sides or floor, nothing floating, and in the box nothing outside."""
+    spec, parts = container(kind, height_m, slope_deg), shapes + shapes[::-1]
+    colliders = [item for _, item in parts]
+    settled = settle(colliders, release(colliders, 4), SETTINGS, spec)
+    here = Pose(UPRIGHT, (0.0, 0.0, 0.0))
+    around = solid(container_mesh(spec), here)
+    bodies = [solid(mesh, pose) for (mesh, _), pose in zip(parts, settled.poses, strict=True)]
+    gaps = [body.min_gap(around, 3.0) for body in bodies]
+    for body, gap, stated in zip(bodies, gaps, settled.gaps_m, strict=True):
+        assert stated * 1000 <= min(gap, 1.0) + 0.05
+        assert gap > 0 or (body ^ around).volume() < 0.05 * body.volume()
+    assert sum(gap <= 1.0 for gap in gaps) >= 3, "most lie on its floor or lean on its sides"
+    assert max(settled.penetrations_m) <= SETTINGS.max_penetration_m
+    if kind == "box":
+        along = np.array([pose.position_m for pose in settled.poses]) @ turn(spec)
+        assert (np.abs(along[:, :2]) < np.array(spec.floor_m) / 2 + 0.01).all()
+    assert settle(colliders, release(colliders, 4), SETTINGS, spec) == settled
+
+
+def test_what_does_not_fit_a_container_is_refused(cube: Part) -> None:
+    _, item = cube
+    spec = replace(container("box", 0.1, 0.0), floor_m=(0.16, 0.05))
+    with pytest.raises(NotSettled, match="object 0 does not fit into the container"):
+        settle([item], [Pose(UPRIGHT, (0.0, 0.0, 0.2))], SETTINGS, spec)
+    within = rescaled(item, 0.9)
+    with pytest.raises(NotSettled, match=r"object 0 penetrates the container by 2\.\d mm"):
+        settle([within], [Pose(UPRIGHT, (0.0, 0.0, 0.1))], SETTINGS, container("box", 0.1, 0.0))
+
+
+def test_what_stands_upright_and_what_does_not(cube: Part) -> None:
+    found = standing(cube[1])
+    assert found is not None and not found.upside_down
+    assert (found.origin_m, found.height_m) == (pytest.approx(0.03, abs=3e-4), pytest.approx(0.06, abs=6e-4))
+    assert found.radius_m == pytest.approx(0.03 * np.sqrt(2), rel=0.01)
+    cone = trimesh.creation.cone(radius=0.03, height=0.05, sections=32)
+    upright, turned = part(cone), part(cone.apply_transform(np.diag([1, -1, -1, 1])))
+    stands = [standing(item) for _, item in (upright, turned)]
+    assert [of is not None and of.upside_down for of in stands] == [False, True]
+    assert standing(part(trimesh.creation.icosphere(subdivisions=3, radius=0.03))[1]) is None
+    leaning = trimesh.creation.box((0.02, 0.02, 0.08))
+    leaning.vertices[:, 0] += 2 * leaning.vertices[:, 2]
+    assert standing(part(leaning)[1]) is None, "its mass centre is not above its foot"
 
 
 @pytest.mark.tless

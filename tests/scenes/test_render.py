@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from synthetless.annotation.instances import ImageAnnotation, PosedModel
 from synthetless.annotation.raycast import Plane, RayCaster
-from synthetless.annotation.scene import scene_caster
+from synthetless.annotation.scene import container_surfaces, scene_caster
 from synthetless.config import load_recipe
 from synthetless.io.models import ObjectModel, load_models
 from synthetless.scenes.render import BlenderSession
@@ -68,7 +68,7 @@ def _annotate(
         PosedModel(item.obj_id, R @ matrix(pose.rotation_wxyz), R @ (np.array(pose.position_m) * 1000) + t)
         for item, pose in zip(spec.objects, poses, strict=True)
     ]
-    return caster.annotate(camera, Plane(R, t, 3000.0), posed)
+    return caster.annotate(camera, Plane(R, t, 3000.0), posed, container_surfaces(caster, spec, R, t))
 
 
 def _assert_agreement(
@@ -119,6 +119,32 @@ def test_pixels_and_poses_agree_for_any_camera(name: str, tmp_path: Path) -> Non
         spec, poses = _scene(overrides, dict.fromkeys(meshes, 0.06), drop)
         compared += _assert_agreement(session, caster, camera, spec, poses, tmp_path)
     assert compared >= 5
+
+
+@pytest.mark.parametrize("kind", ["box", "tray"])
+def test_pixels_and_poses_agree_in_a_container(kind: str, tmp_path: Path) -> None:
+    """Behind its sides and over its rim; the depth of the container itself is right, too."""
+    camera, meshes = CAMERAS["off-centre"], _meshes()
+    session = BlenderSession(
+        {("model", key): Mesh(vertices / 1000, faces) for key, (vertices, faces) in meshes.items()},
+        camera,
+        RenderSettings(),
+        TableSettings(),
+        log=tmp_path / "log",
+    )
+    caster = RayCaster({("model", key): mesh for key, mesh in meshes.items()})
+    overrides = ["objects.count=[7, 9]", "camera.distance_m=[0.5, 0.6]", "camera.elevation_deg=[25, 35]"]
+    spec, poses = _scene([*overrides, f"release.container={kind}"], dict.fromkeys(meshes, 0.06), 0)
+    assert spec.container is not None and spec.container.kind == kind
+    poses = [dataclasses.replace(pose, position_m=(*pose.position_m[:2], 0.05)) for pose in poses]
+    assert _assert_agreement(session, caster, camera, spec, poses, tmp_path) >= 3
+    with session.scene(spec, poses) as scene:
+        depth_mm, extrinsics = cycles_geometry(scene, 0, tmp_path).depth_mm, scene.extrinsics(0)
+    ours = _annotate(caster, camera, spec, poses, extrinsics).depth_mm
+    bare = _annotate(caster, camera, dataclasses.replace(spec, container=None), poses, extrinsics).depth_mm
+    shows_it = ours != bare
+    assert shows_it.mean() > 0.02
+    assert np.mean(np.abs(depth_mm - ours)[shows_it] < 0.5) > 0.99
 
 
 @pytest.mark.tless

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
+import math
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -14,12 +17,14 @@ from pydantic import TypeAdapter
 from scipy import stats
 
 from synthetless.config import load_recipe
+from synthetless.scenes.container import turn
 from synthetless.scenes.rotations import matrix, random_rotation
 from synthetless.scenes.sampling import Catalogue, sample_scene
 from synthetless.scenes.settings import SceneSettings
-from synthetless.scenes.spec import SceneSpec
+from synthetless.scenes.spec import SceneSpec, Standing
 
-CATALOGUE = Catalogue({1: 0.06, 5: 0.11, 8: 0.217}, {3: 0.09}, ("a.jpg", "b.jpg"))
+DIAMETERS = {1: 0.06, 5: 0.11, 8: 0.217}
+CATALOGUE = Catalogue(DIAMETERS, {3: 0.09}, ("a.jpg", "b.jpg"))
 MANY = 400
 
 
@@ -113,6 +118,58 @@ def test_distractors_are_mixed_in() -> None:
     assert len({tuple(item.role for item in scene.objects) for scene in scenes}) > 1
 
 
+def test_containers_are_drawn_by_their_shares_and_change_the_release_alone(scenes: list[SceneSpec]) -> None:
+    settings = load_recipe(None, ["release.container.box.share=0.4", "release.container.tray.share=0.2"])
+    boxed = [sample_scene(settings, CATALOGUE, seed=7, drop=drop) for drop in range(MANY)]
+    kinds = Counter("none" if scene.container is None else scene.container.kind for scene in boxed)
+    assert stats.chisquare([kinds[kind] for kind in ("none", "box", "tray")], [160, 160, 80]).pvalue > 1e-4
+    for scene, before in zip(boxed, scenes, strict=True):
+        if scene.container is None:
+            assert scene == before
+            continue
+        within = settings.release.container.box if scene.container.kind == "box" else settings.release.container.tray
+        for name in ("height_m", "wall_m", "slope_deg"):
+            low, high = getattr(within, name)
+            assert low <= getattr(scene.container, name) <= high
+        assert all(within.sides_m[0] <= side <= within.sides_m[1] for side in scene.container.floor_m)
+        released = [
+            dataclasses.replace(a, release=b.release) for a, b in zip(scene.objects, before.objects, strict=True)
+        ]
+        assert dataclasses.replace(scene, container=None, objects=tuple(released)) == before
+        assert [a.release.rotation_wxyz for a in scene.objects] == [b.release.rotation_wxyz for b in before.objects]
+        again = sample_scene(settings, CATALOGUE, seed=7, drop=scene.drop, attempt=1)
+        assert again.container == scene.container
+        for item in scene.objects:
+            reach = np.array(item.release.position_m) @ turn(scene.container)
+            room = np.maximum(np.array(scene.container.floor_m) - DIAMETERS[item.obj_id], 0) / 2
+            assert (np.abs(reach[:2]) <= room + 1e-9).all()
+            assert item.release.position_m[2] > scene.container.wall_m + DIAMETERS[item.obj_id] / 2
+
+
+@pytest.mark.parametrize("name", ["none", "box"])
+def test_upright_objects_are_apart_and_the_others_are_poured_over_them(name: str) -> None:
+    settings = load_recipe(None, ["release.upright=0.5", f"release.container={name}", "objects.count=[9, 9]"])
+    stands = {i: Standing(i == 5, 0.4 * d, 0.8 * d, 0.3 * d) for i, d in DIAMETERS.items()}
+    catalogue = dataclasses.replace(CATALOGUE, standing=stands)
+    share = []
+    for drop in range(60):
+        scene = sample_scene(settings, catalogue, seed=3, drop=drop)
+        ground = 0.0 if scene.container is None else scene.container.wall_m
+        down = [item for item in scene.objects if abs(matrix(item.release.rotation_wxyz)[2, 2]) > 1 - 1e-12]
+        share.append(len(down) / 9)
+        for item in down:
+            assert np.sign(matrix(item.release.rotation_wxyz)[2, 2]) == (-1 if item.obj_id == 5 else 1)
+            foot = item.release.position_m[2] - stands[item.obj_id].origin_m
+            assert foot == pytest.approx(ground + 0.001)
+        for a, b in itertools.combinations(down, 2):
+            apart = math.dist(a.release.position_m[:2], b.release.position_m[:2])
+            assert apart >= stands[a.obj_id].radius_m + stands[b.obj_id].radius_m + 0.005
+        highest = max((ground + 0.001 + stands[item.obj_id].height_m for item in down), default=ground)
+        poured = [item for item in scene.objects if item not in down]
+        assert all(item.release.position_m[2] - DIAMETERS[item.obj_id] / 2 > highest for item in poured)
+    assert np.mean(share) == pytest.approx(0.5, abs=0.1) if name == "none" else np.mean(share) > 0.2
+
+
 def test_several_views_share_the_scene_and_differ() -> None:
     settings = load_recipe(None, ["camera.views_per_drop=3"])
     scene = sample_scene(settings, CATALOGUE, seed=1, drop=0)
@@ -123,7 +180,7 @@ def test_several_views_share_the_scene_and_differ() -> None:
 @given(st.integers(0, 2**63 - 1), st.integers(0, 10**8))
 @hypothesis_settings(max_examples=30)
 def test_a_scene_survives_json(seed: int, drop: int) -> None:
-    scene = sample_scene(SceneSettings(), CATALOGUE, seed, drop)
+    scene = sample_scene(load_recipe(None, ["release.container.box.share=0.5"]), CATALOGUE, seed, drop)
     text = json.dumps(dataclasses.asdict(scene))
     assert TypeAdapter(SceneSpec).validate_json(text) == scene
 

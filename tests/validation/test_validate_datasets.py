@@ -32,6 +32,7 @@ MAKES = {
     "visible within a tolerance": ("labels.visibility_delta_mm=5", EVERYTHING),
     "a small table, fine depth": ("table.size_m=0.5", "encoding.depth_scale=0.01"),
     "much beyond the depth's range": ("encoding.depth_scale=0.0065",),
+    "objects in boxes": ("release.container=box", "release.container.box.height_m=[0.03, 0.2]", EVERYTHING),
     "a low camera": ("camera.elevation_deg=[3, 8]",),
     "other labels": ("labels.scheme=atlas",),
 }
@@ -64,6 +65,30 @@ def test_distractors_hide_but_need_no_labels(cluttered: tuple[Path, Path]) -> No
         for info in entries
     ]
     assert min(hidden) < 0.9
+
+
+def test_a_box_hides_and_is_checked(valid: Path, tmp_path: Path, parts: Path) -> None:
+    """What the record says of it is what the recipe draws, and what the files show."""
+    root = tmp_path / "d"
+    narrow = ("release.container.box.sides_m=[0.13, 0.14]", "release.container.box.height_m=[0.1, 0.15]")
+    valid_dataset.write_dataset(root, parts, ("release.container=box", *narrow))
+    shares = [
+        np.mean([info["visib_fract"] for image in read_scene_json(of.scene_gt_info).values() for info in image])
+        for of in (ScenePaths.of(folder, 1) for folder in (root, valid))
+    ]
+    assert shares[0] < shares[1] - 0.1
+
+    def found(change: str, value: float) -> set[tuple[str, str]]:
+        damaged = tmp_path / change
+        shutil.copytree(root, damaged, ignore=shutil.ignore_patterns(".records"))
+        with Victim(damaged).specs() as lines:
+            lines[IMAGE]["scene"]["container"][change] = value
+        report = validate(damaged, workers=1)
+        return {(f.kind, f.file.name) for f in report.findings if f.image == IMAGE}
+
+    assert {("spec", "scene_spec.jsonl"), ("depth", "000001.png")} <= found("height_m", 0.05)
+    assert found("rotation_deg", 1e300) >= {("spec", "scene_spec.jsonl")}
+    assert found("wall_m", -1.0) == {("spec", "scene_spec.jsonl")}, "nothing to cast at"
 
 
 def test_rays_that_cannot_be_cast_are_noted(cluttered: tuple[Path, Path]) -> None:
