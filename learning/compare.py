@@ -151,7 +151,11 @@ def compare(comparison: Comparison, out: Path, workers: int | None = None) -> li
         UserError: a model is missing, or the folder cannot be written or holds a comparison with other settings.
     """
     models = load_models(comparison.models, comparison.objects)
+    datasets = {"rendered": comparison.rendered, "tuning": comparison.tuning}
+    of_datasets = {name: rendered_crops(comparison, root) for name, root in datasets.items() if root is not None}
     _claim(out, comparison, models)
+    for name, crops in of_datasets.items():
+        _keep(crops, out / "crops" / name)
     shares = [("train", comparison.train_crops, 1), ("validation", comparison.validation_crops, 2)]
     for name, count, seed in shares:
         folder = out / "crops" / name
@@ -159,9 +163,6 @@ def compare(comparison: Comparison, out: Path, workers: int | None = None) -> li
             continue
         parts = [(comparison, seed, first, min(500, count - first)) for first in range(0, count, 500)]
         _keep(Crops.concatenate(list(each(_make_crops, parts, workers, f"{name} crops", "share"))), folder)
-    for name, dataset in (("rendered", comparison.rendered), ("tuning", comparison.tuning)):
-        if dataset is not None:
-            _keep(rendered_crops(comparison, dataset), out / "crops" / name)
     tasks = [_Task(comparison, labels, seed, out) for seed in range(comparison.seeds) for labels in comparison.labels]
     runs = list(each(_run, tasks, workers, "runs", "run"))
     write_json(out / "runs.json", {f"{run.labels} {run.seed}": _plain(run) for run in runs})

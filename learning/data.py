@@ -123,6 +123,8 @@ class Photographs:
             UserError: its linear light is not there.
         """
         image = self._images.image(number)
+        if not image.paths.exr(image.im_id).exists():
+            raise UserError(f"{image.paths.root}: has no linear light to take anew (output exr); set data.sensor=none")
         pixels = capture(image.linear(), self._sensor, rng, self._gain(image))
         return replace(sample_of(image), pixels=pixels)
 

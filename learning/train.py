@@ -237,8 +237,11 @@ def train(
         raise UserError(f"{data[0]}: has no images")
     parts = read_parts(images.datasets, training.data.objects, models)
     batcher = SampleBatcher(parts.maker(training), parts.boxes_mm, parts.ids, training.data.min_visib_fract)
+    learned = _Pictures(images, batcher, training)
+    height, width = learned[0, 0][0].shape[
+        1:
+    ]  # refuses data that has not what is asked for, before anything is written
     with _processes(device) as (rank, place):
-        height, width, _ = images[0].pixels.shape
         _refuse_little_memory(training.schedule.images_per_step * height * width, place)
         if rank == 0:
             write_run(run, training, parts)
@@ -249,7 +252,7 @@ def train(
             module = nn.parallel.DistributedDataParallel(module, find_unused_parameters=True)
         first = _next_step(run)
         loader = DataLoader(
-            _Pictures(images, batcher, training),
+            learned,
             batch_sampler=_Steps(len(images), training, rank, first),
             num_workers=training.data.workers,
             collate_fn=_stacked,

@@ -263,7 +263,10 @@ def test_wrong_comparisons_are_one_line(builtin_models: Path, tmp_path: Path) ->
     with pytest.raises(UserError, match="a dataset to tune on is given, but none of rendered images to measure on"):
         Comparison(builtin_models, tuning=tmp_path)
     with pytest.raises(UserError, match="no mesh for object 99"):
-        compare(Comparison(builtin_models, objects=(99,)), tmp_path, 1)
+        compare(Comparison(builtin_models, objects=(99,)), tmp_path / "out", 1)
+    with pytest.raises(UserError, match="no BOP dataset"):
+        compare(Comparison(builtin_models, rendered=tmp_path), tmp_path / "out", 1)
+    assert not (tmp_path / "out").exists()
 
 
 def _tiny(run: Path, steps: int, save_every: int = 10) -> Any:

@@ -373,6 +373,8 @@ def test_what_cannot_work_is_refused_before_it_starts(
         train(_training(), [tmp_path / "nowhere"], tmp_path / "b", "cpu")
     with pytest.raises(UserError, match="is a run with other training"):
         train(_training("labels=true"), [valid], trained, "cpu")
+    with pytest.raises(UserError, match=r"has no linear light to take anew \(output exr\); set data.sensor=none"):
+        train(_training("data.sensor=ranges"), [valid], tmp_path / "a", "cpu")
     with pytest.raises(UserError, match="device 'cuda:99' cannot be used"):
         choose_device("cuda:99")
     monkeypatch.setattr("synthetless.learning.train._BYTES_PER_PIXEL", 10**9)
