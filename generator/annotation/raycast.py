@@ -375,6 +375,23 @@ class RayCaster:
             object_coordinates_mm=scene.object_coordinates_mm(len(instances)) if object_coordinates else None,
         )
 
+    def whole_coordinates_mm(
+        self, camera: Intrinsics, posed: PosedModel
+    ) -> tuple[Window, NDArray[np.bool_], NDArray[np.float64]]:
+        """Where a body alone is met inside the image, whatever hides it.
+
+        Returns:
+            A window of the image, empty if the body is not in it; (h, w) over it, where the body is; and (h, w, 3)
+            the point that is met, model frame, mm, 0 elsewhere.
+        """
+        hits = self._cast(camera, posed, image_window(camera))
+        met = hits.faces != MISS
+        rows, columns = pixels_where(met)
+        points_mm = hits.rays.at(rows, columns) * hits.depth_mm[rows, columns, None]
+        coordinates_mm = np.zeros((*met.shape, 3))
+        coordinates_mm[rows, columns] = hits.body.to_model(points_mm)
+        return hits.rays.window, met, coordinates_mm
+
     def pose(self, posed: PosedModel | PosedSurface) -> PosedSurface:
         """A mesh in front of the camera; errors as in ``annotate``."""
         if isinstance(posed, PosedSurface):

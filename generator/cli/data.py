@@ -125,3 +125,30 @@ def yolo_command(
         export_yolo(dataset, to, task, split, amodal, classes, val_percent, copy)
     file = to / DATA_FILE
     say(json.dumps({"task": task, "file": str(file)}) if as_json else f"{task} labels: {file}")
+
+
+def bop_command(
+    dataset: Annotated[Path, typer.Argument(help="The dataset's folder.")],
+    to: Annotated[Path, typer.Option(metavar="DIR", help="Where BOP datasets are; NAME is written into it.")],
+    name: Annotated[str, typer.Option("--as", metavar="NAME", help="Of the dataset, as loaders know it.")] = "tless",
+    to_split: Annotated[str, typer.Option("--split", metavar="NAME", help="Folder of scenes to write.")] = "train_pbr",
+    split: Annotated[str | None, typer.Option("--from-split", metavar="NAME", help="The dataset's own.")] = None,
+    jpg: Annotated[int | None, typer.Option(min=1, max=100, metavar="Q", help="JPEG images of this quality.")] = None,
+    pixel_centre: Annotated[
+        float, typer.Option(metavar="0|0.5", help="0.5 for loaders that subtract half a pixel, or render so.")
+    ] = 0.0,
+    scenes: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Scene folders; default: 1000 images in each.")
+    ] = None,
+    xyz_crops: Annotated[bool, typer.Option("--xyz-crops", help="Object coordinates, as GDR-Net reads them.")] = False,
+    fps: Annotated[bool, typer.Option("--fps", help="Farthest points of the models, likewise.")] = False,
+    copy: Copy = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write a BOP folder as registered loaders expect it."""
+    from synthetless.dataset.labels import undisturbed
+    from synthetless.exports.bop import export_bop
+
+    with undisturbed(dataset, may_grow=True):
+        folder = export_bop(dataset, to, name, to_split, split, jpg, pixel_centre, scenes, xyz_crops, fps, copy)
+    say(json.dumps({"folder": str(folder), "split": to_split}) if as_json else f"{to_split} of {name}: {folder}")

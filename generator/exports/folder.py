@@ -19,13 +19,22 @@ from pydantic import TypeAdapter, ValidationError
 from synthetless.dataset.labels import refuse_half_labelled
 from synthetless.dataset.layout import refuse_target
 from synthetless.errors import UserError
+from synthetless.exports.annotated import licence_of
 from synthetless.io.files import atomic_folder, read_bytes, read_json, write_json
 from synthetless.io.parallel import each
 
 EXPORT_FILE = "export.json"
 
-Content = bytes | Path
-"""Of a file: computed bytes, or the file of the dataset that it is."""
+
+@dataclass(frozen=True)
+class Same:
+    """Another file of the export, by its name, which is written before."""
+
+    name: str
+
+
+Content = bytes | Path | Same
+"""Of a file: computed bytes, or the file, of the dataset or of the export, that it is."""
 Entry = tuple[str, Content]
 """Its name, relative to the export's folder, and its content."""
 Fault = Literal["missing", "differs"]
@@ -65,7 +74,7 @@ class FolderExport:
     def request(self) -> dict[str, Any]:
         """Content of export.json."""
         asked = {key: value for key, value in asdict(self).items() if key != "dataset"}
-        return {"kind": self.kind, "options": asked}
+        return {"kind": self.kind, "options": asked, "licence": licence_of(self.dataset)}
 
 
 def write_export(export: FolderExport, to: Path, workers: int | None = None) -> None:
@@ -110,13 +119,13 @@ def read_export(folder: Path, dataset: Path, kinds: Iterable[type[FolderExport]]
 def compare(folder: Path, entries: Iterable[Entry]) -> Iterator[tuple[str, Fault | None]]:
     """Each file that there should be, with what is wrong with it."""
     for name, content in entries:
-        path = folder / name
+        path, source = folder / name, _source(folder, content)
         if not path.is_file():
             yield name, "missing"
-        elif isinstance(content, Path) and path.resolve() == content.resolve():
+        elif isinstance(source, Path) and path.resolve() == source.resolve():
             yield name, None
         else:
-            expected = read_bytes(content) if isinstance(content, Path) else content
+            expected = read_bytes(source) if isinstance(source, Path) else source
             yield name, None if read_bytes(path) == expected else "differs"
 
 
@@ -134,19 +143,25 @@ def _write_part(export: FolderExport, folder: Path, part: Any) -> None:
 def _write(folder: Path, entries: Iterable[Entry], copy: bool) -> None:
     """Write into a folder that nobody sees before it is whole."""
     for name, content in entries:
-        path = folder / name
+        path, source = folder / name, _source(folder, content)
         path.parent.mkdir(parents=True, exist_ok=True)
-        if isinstance(content, bytes):
-            path.write_bytes(content)
+        if isinstance(source, bytes):
+            path.write_bytes(source)
         elif copy:
-            shutil.copyfile(content, path)
+            shutil.copyfile(source, path)
         else:
-            _link(content, path)
+            _link(source, path)
+
+
+def _source(folder: Path, content: Content) -> bytes | Path:
+    return folder / content.name if isinstance(content, Same) else content
 
 
 def _link(source: Path, path: Path) -> None:
-    """A relative link, so that dataset and export may be moved together."""
+    """A relative link, so that dataset and export may be moved together; of a file that is there."""
     try:
-        path.symlink_to(os.path.relpath(source.resolve(), path.parent.resolve()))
+        path.symlink_to(os.path.relpath(source.resolve(strict=True), path.parent.resolve()))
+    except FileNotFoundError:
+        raise UserError(f"{source}: not found") from None
     except OSError as error:
         raise UserError(f"{path.parent}: no links can be made here ({error.strerror}); export with --copy") from None

@@ -15,6 +15,7 @@ from pycocotools import mask as coco_mask
 from synthetless.dataset.layout import AMBIGUITY_FILE, DATASET_FILE, SYMMETRIES_FILE, ScenePaths
 from synthetless.dataset.records import uncompressed_rle
 from synthetless.errors import UserError
+from synthetless.exports.bop import BopExport
 from synthetless.exports.coco import export_coco, polygons_of
 from synthetless.exports.folder import FolderExport, compare, owned_files, read_export
 from synthetless.exports.webdataset import KEYS_FILE
@@ -227,7 +228,7 @@ def _check_keys(path: Path, numbers: Mapping[str, int]) -> Iterator[Finding]:
 
 # Folders
 
-FOLDER_EXPORTS: tuple[type[FolderExport], ...] = (YoloExport,)
+FOLDER_EXPORTS: tuple[type[FolderExport], ...] = (BopExport, YoloExport)
 _FAULTS = {
     "missing": "not there; export anew",
     "differs": "is not what the dataset gives now: the export is older, or damaged; export anew",

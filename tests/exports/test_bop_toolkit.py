@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from bop_toolkit import NAME, SPLIT_NAME, SPLIT_TYPE, Toolkit
 from numpy.typing import NDArray
+from trees import contents
 
 from synthetless.config import load_recipe
 from synthetless.dataset.layout import ScenePaths
 from synthetless.dataset.records import GtInfoEntry, read_scene_json
+from synthetless.exports.bop import export_bop
 from synthetless.exports.webdataset import export_webdataset
 from synthetless.generation.generate import Execution, generate
 from synthetless.io.files import read_json
@@ -27,7 +29,6 @@ ROOT = Path(__file__).resolve().parents[2]
 SPLIT_OPTIONS = ("--dataset", NAME, "--dataset_split", SPLIT_NAME, "--dataset_split_type", SPLIT_TYPE)
 BIG_PX = 500
 """Of smaller silhouettes the rounding of their borders is too large a share."""
-RESULTS = f"truth_{NAME}-{SPLIT_NAME}-{SPLIT_TYPE}"
 
 
 @dataclass(frozen=True)
@@ -140,23 +141,81 @@ def test_the_truth_scores_one(toolkit: Toolkit, parts: Path) -> None:
     toolkit.take(parts)
     split = {"dataset": NAME, "dataset_split": SPLIT_NAME, "dataset_split_type": SPLIT_TYPE}
     toolkit.script("enumerate_test_targets.py", **split)
-    targets = json.loads((toolkit.root / "test_targets_bop19.json").read_text())
-    assert sum(target["inst_count"] for target in targets) > 20
-    results = toolkit.folder / "results"
-    options = ("--dataset", NAME, "--split", SPLIT_NAME, "--split_type", SPLIT_TYPE, "--results_path", str(results))
+    _score_the_truth(toolkit, SPLIT_TYPE, 20)
+
+
+def _score_the_truth(toolkit: Toolkit, split_type: str, fewest: int) -> None:
+    """Every instance of the targets is found, and more than ``fewest`` are asked for."""
+    results, name = toolkit.folder / f"results_{split_type}", f"truth_{NAME}-{SPLIT_NAME}-{split_type}"
+    options = ("--dataset", NAME, "--split", SPLIT_NAME, "--split_type", split_type, "--results_path", str(results))
     toolkit.script("create_pose_results_file_from_gt.py", *options, "--targets_filename", "test_targets_bop19.json")
     (written,) = results.iterdir()
-    written.rename(results / f"{RESULTS}.csv")
+    written.rename(results / f"{name}.csv")
     for error, threshold in (("vsd", 0.05), ("mssd", 0.05), ("mspd", 5)):
-        of = (f"--error_type={error}", "--n_top=-1", "--vsd_taus=0.05", f"--result_filenames={RESULTS}.csv")
-        toolkit.script("eval_calc_errors.py", *of, "--renderer_type=vispy")
-        (errors,) = (toolkit.folder / "eval" / RESULTS).glob(f"error={error}_*")
-        scores = (f"--error_dir_paths={RESULTS}/{errors.name}", f"--correct_th_{error}={threshold}")
+        of = (f"--error_type={error}", "--n_top=-1", "--vsd_taus=0.05", f"--result_filenames={name}.csv")
+        toolkit.script("eval_calc_errors.py", *of, "--renderer_type=vispy", f"--results_path={results}")
+        (errors,) = (toolkit.folder / "eval" / name).glob(f"error={error}_*")
+        scores = (f"--error_dir_paths={name}/{errors.name}", f"--correct_th_{error}={threshold}")
         toolkit.script("eval_calc_scores.py", *scores)
         (file,) = errors.glob("scores_*.json")
         score = json.loads(file.read_text())
         assert score["recall"] == 1.0, error
-        assert score["targets_count"] == score["tp_count"] > 20
+        assert score["targets_count"] == score["tp_count"] > fewest
+
+
+@pytest.fixture(scope="module")
+def pbr(toolkit: Toolkit, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A dataset with images as large as those of train_pbr of T-LESS, and its export by that name."""
+    camera = {"width": 720, "height": 540, "fx": 1075.65, "fy": 1073.9, "cx": 355.7, "cy": 262.4}
+    made = _generate(
+        "builtin",
+        tmp_path_factory.mktemp("pbr") / "d",
+        "labels.visibility_delta_mm=0",
+        *(f"camera.{key}={value}" for key, value in camera.items()),
+    )
+    shutil.rmtree(toolkit.root, ignore_errors=True)
+    return made, export_bop(made, toolkit.folder, NAME, jpg=90, pixel_centre=0.5, scenes=2, workers=1)
+
+
+def test_on_an_exported_folder_the_scripts_agree(toolkit: Toolkit, pbr: tuple[Path, Path]) -> None:
+    """Masks, counts and COCO files, made in the folder as it is; the dataset that it is of stays as it was."""
+    made, exported = pbr
+    before = contents(made)
+    scenes = [ScenePaths.of(exported, number, "train_pbr") for number in (0, 1)]
+    ours = [(read_scene_json(scene.scene_gt_info), read_json(scene.scene_gt_coco)) for scene in scenes]
+    options = ("--dataset", NAME, "--dataset_split", "train", "--dataset_split_type", "pbr")
+    toolkit.script("calc_gt_coco.py", *options, "--use_all_gt")
+    for scene, (_, coco) in zip(scenes, ours, strict=True):
+        found = read_json(scene.scene_gt_coco)
+        assert found["annotations"] == coco["annotations"]
+        assert [image["file_name"] for image in found["images"]] == [image["file_name"] for image in coco["images"]]
+    toolkit.script("calc_gt_masks.py", *options, delta=0.2)
+    toolkit.script(
+        "calc_gt_info.py",
+        dataset=NAME,
+        dataset_split="train",
+        dataset_split_type="pbr",
+        delta=0.2,
+        modality=None,
+        sensor=None,
+    )
+    compared = 0
+    for scene, (infos, _) in zip(scenes, ours, strict=True):
+        theirs = read_scene_json(scene.scene_gt_info)
+        for im_id, of_image in infos.items():
+            for gt_id, info in enumerate(of_image):
+                if info["px_count_all"] > BIG_PX:
+                    assert abs(info["visib_fract"] - theirs[im_id][gt_id]["visib_fract"]) <= 0.01
+                    mask = np.count_nonzero(_mask(scene.mask_visib(im_id, gt_id)))
+                    assert abs(mask - info["px_count_visib"]) <= 0.01 * info["px_count_all"]
+                    compared += 1
+    assert compared > 20
+    assert contents(made) == before
+
+
+def test_on_an_exported_folder_the_truth_scores_one(toolkit: Toolkit, pbr: tuple[Path, Path]) -> None:
+    """With the targets that the export wrote."""
+    _score_the_truth(toolkit, "pbr", 20)
 
 
 def test_the_toolkit_reads_the_shards(toolkit: Toolkit, parts: Path, tmp_path: Path) -> None:

@@ -14,8 +14,11 @@ from pathlib import Path
 import pytest
 from trees import contents
 
+from synthetless.config import SPLIT
 from synthetless.errors import UserError
+from synthetless.exports.bop import BopExport
 from synthetless.exports.coco import export_coco
+from synthetless.exports.folder import write_export
 from synthetless.exports.webdataset import export_webdataset, relabel_webdataset
 from synthetless.exports.yolo import export_yolo
 from synthetless.io.files import atomic_folder
@@ -25,6 +28,7 @@ Export = Callable[[Path, Path], object]
 EXPORTS: dict[str, Export] = {
     "coco": export_coco,
     "webdataset": lambda dataset, to: export_webdataset(dataset, to, workers=1),
+    "bop": lambda dataset, to: write_export(BopExport(dataset, SPLIT), to, workers=1),
     "yolo": lambda dataset, to: export_yolo(dataset, to, workers=1),
     "relabel": lambda dataset, to: relabel_webdataset(dataset, to, workers=1),
 }
