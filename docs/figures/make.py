@@ -238,6 +238,7 @@ FIGURES: dict[str, Callable[[], bytes]] = {
     "symmetry_charts.png": charts_figure,
     "symmetry_part.png": part_figure,
     "symmetry_notch.png": lambda: _png(notch.draw(), 120),
+    "symmetry_hidden.png": lambda: _png(notch.draw_hidden(), 120),
 }
 
 

@@ -1,14 +1,17 @@
-"""The figure of docs/symmetry.md about a cylinder with a notch: what its images leave open."""
+"""The figures of docs/symmetry.md about a cylinder with a notch: what its images leave open."""
 
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from synthetless.annotation.instances import PosedModel
 from synthetless.annotation.raycast import RayCaster
+from synthetless.preview.statistics import SECTORS, cell_centres, cell_outlines
 from synthetless.scenes.spec import Intrinsics
 from synthetless.symmetry import CanonicalMap, SymmetryGroup
 from synthetless.symmetry.ambiguity import Ambiguity, Cosets, see
@@ -20,6 +23,8 @@ QUASI = SymmetryGroup("SO(2)")
 CAMERA = Intrinsics(130, 120, 500.0, 500.0, 64.5, 59.5)
 DISTANCE_MM = 350.0
 SHOWN = (0, 75, 180)
+HIDING = ((4, 0), (3, 2), (6, 14))
+"""Band and sector of views that are shown: from behind, from beside, and from behind and above."""
 ELEVATIONS = ((10, "-"), (60, "--"))
 _STEP_DEG = 2
 
@@ -54,21 +59,57 @@ def judged(caster: RayCaster, posed: PosedModel) -> Ambiguity:
     return see(caster, CAMERA, posed, R_canonical, Cosets.of(QUASI, SymmetryGroup.trivial()))
 
 
+def seen_from(direction: Floats) -> PosedModel:
+    """Upright in the image, the camera in a direction (3,) of the model frame."""
+    right = np.cross([0.0, 0.0, 1.0], direction)
+    right /= np.linalg.norm(right)
+    R_m2c = np.stack([right, np.cross(-direction, right), -direction])
+    return PosedModel(1, R_m2c, np.array([0.0, 0.0, DISTANCE_MM]))
+
+
+def draw_hidden() -> Figure:
+    """The viewing sphere by how many turns the view leaves open, and three views of it."""
+    caster = RayCaster({("model", 1): mesh()})
+    directions = cell_centres()
+    open_turns = np.array([len(judged(caster, seen_from(each)).alike) for each in directions.reshape(-1, 3)])
+    figure = Figure((9.6, 2.6), layout="constrained", facecolor="white")
+    globe, *panels = figure.subplots(1, 1 + len(HIDING), width_ratios=[2.1, *[1] * len(HIDING)])
+    cells = PolyCollection(list(cell_outlines().reshape(len(open_turns), -1, 2)), cmap="viridis_r", edgecolors="face")
+    cells.set_array(open_turns)
+    cells.set_clim(1, 12)
+    globe.add_collection(cells)
+    globe.set(xlim=(-2.9, 2.9), ylim=(-1.47, 1.47), aspect="equal")
+    globe.set_axis_off()
+    figure.colorbar(cells, ax=globe, shrink=0.8, ticks=[1, 4, 8, 12], label="turns left open, of 24")
+    middles = cell_outlines().mean(axis=2)
+    for number, (axes, (band, sector)) in enumerate(zip(panels, HIDING, strict=True), start=1):
+        x, y = middles[band, sector]
+        ink = "white" if open_turns[band * SECTORS + sector] > 4 else "black"
+        globe.text(x, y, str(number), color=ink, ha="center", va="center", fontsize=9, fontweight="bold")
+        picture(axes, caster, seen_from(directions[band, sector]))
+        axes.set_title(f"{number}: {open_turns[band * SECTORS + sector]} of 24 open", fontsize=8)
+    return figure
+
+
+def picture(axes: Axes, caster: RayCaster, posed: PosedModel) -> None:
+    """Shaded by the direction of the surface."""
+    seen = caster.annotate(CAMERA, None, [posed], normals=True)
+    assert seen.normals is not None
+    shade = 0.42 + 0.5 * np.clip(seen.normals @ np.array([-0.35, -0.75, -0.56]), 0, 1)
+    axes.imshow(np.where(seen.instance_ids == 0, shade, 1.0), cmap="gray", vmin=0, vmax=1)
+    axes.set_axis_off()
+
+
 def draw() -> Figure:
     """Three views with their view ambiguity, and the view ambiguity over the turn of the part."""
     caster = RayCaster({("model", 1): mesh()})
     figure = Figure((9.6, 2.6), layout="constrained", facecolor="white")
     panels = figure.subplots(1, len(SHOWN) + 1, width_ratios=[1] * len(SHOWN) + [1.9])
-    light = np.array([-0.35, -0.75, -0.56])
     for axes, azimuth in zip(panels, SHOWN, strict=False):
         posed = pose(azimuth, ELEVATIONS[0][0])
-        seen = caster.annotate(CAMERA, None, [posed], normals=True)
-        assert seen.normals is not None
-        shade = 0.42 + 0.5 * np.clip(seen.normals @ light, 0, 1)
-        axes.imshow(np.where(seen.instance_ids == 0, shade, 1.0), cmap="gray", vmin=0, vmax=1)
+        picture(axes, caster, posed)
         open_turns = len(judged(caster, posed).alike)
         axes.set_title(f"turned by {azimuth}°: {open_turns} of 24 open", fontsize=8)
-        axes.set_axis_off()
     turns = np.arange(0, 361, 10)
     for elevation, style in ELEVATIONS:
         shares = [judged(caster, pose(float(turn), elevation)).view_ambiguity for turn in turns]

@@ -6,7 +6,7 @@ What is drawn is data, as outlines and lines in pixels of the image; pixel (i, j
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,8 @@ from synthetless.io.files import atomic_write, read_bytes
 from synthetless.scenes.spec import Material, PlaneSpec, RoomSpec, SensorSpec, Vector, View
 from synthetless.scenes.srgb import srgb_from_linear
 from synthetless.scenes.textures import PhotoTexture
+from synthetless.symmetry import SymmetryTable
+from synthetless.symmetry.ambiguity import Cosets
 
 Floats = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
@@ -47,6 +49,7 @@ class ImageTask:
         image: what the dataset says of it; every instance has a label and visibility.
         recorded: how it was made, if that was recorded.
         infos: models_info.json.
+        symmetries: symmetries.json, if instances have a ``quasi``.
         size_px: width and height, if camera.json says them; used where there is no picture.
         to: the folder of the pages.
     """
@@ -54,6 +57,7 @@ class ImageTask:
     image: Image
     recorded: ImageSpec | None
     infos: Mapping[int, ModelInfo]
+    symmetries: SymmetryTable | None
     size_px: tuple[int, int] | None
     to: Path
 
@@ -118,7 +122,20 @@ def _instance(task: ImageTask, instance: Instance) -> dict[str, Any]:
         "outlines": {name: outline(images.decode_mask(read_bytes(path), path)) for name, path in existing.items()},
         "true": _pose(K, instance.R_m2c, instance.t_m2c, model),
         "canonical": _pose(K, label.R_m2c, label.t_m2c, model),
+        "cosets": 0 if instance.quasi is None else len(instance.quasi.alike),
+        "alike": [_pose(K, R, t, model) for R, t in _alike(instance, task.symmetries)],
     }
+
+
+def _alike(instance: Instance, symmetries: SymmetryTable | None) -> Iterator[tuple[Floats, Floats]]:
+    """A pose of each coset that the image cannot tell from the true one, without that one."""
+    if instance.quasi is None or symmetries is None:
+        return
+    entry = symmetries.entries[instance.obj_id]
+    assert entry.quasi is not None  # or the label would not be of this table
+    cosets = Cosets.of(entry.quasi.group, entry.group)
+    true, Rs, ts = cosets.candidates(instance.R_m2c, instance.t_m2c, instance.quasi.R_m2c)
+    yield from ((Rs[number], ts[number]) for number in np.flatnonzero(instance.quasi.alike) if number != true)
 
 
 def _pose(K: Floats, R_m2c: Floats, t_m2c: Floats, model: ModelInfo) -> dict[str, list[Segment]]:

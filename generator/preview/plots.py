@@ -11,14 +11,23 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from synthetless.errors import UserError
 from synthetless.preview.distributions import Distribution
-from synthetless.preview.statistics import CELLS, NEAR_JUMP_DEG, ClassStatistics, Statistics, cell_outlines
+from synthetless.preview.statistics import (
+    CELLS,
+    NEAR_JUMP_DEG,
+    ClassStatistics,
+    DetailStatistics,
+    Statistics,
+    cell_outlines,
+)
 from synthetless.symmetry.atlas import SCHEMES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.collections import PolyCollection
     from matplotlib.figure import Figure
 
 _INK, _LIGHT_INK = "#41474e", "#c4cad1"
@@ -71,6 +80,8 @@ def plots(of: Statistics) -> Iterator[tuple[str, bytes]]:
             yield "coverage", coverage_plot(of.classes)
         for each_class in of.classes:
             yield f"sphere_{each_class.obj_id}", sphere_plot(each_class)
+            if each_class.detail is not None:
+                yield f"detail_{each_class.obj_id}", detail_plot(each_class.views, each_class.detail)
 
 
 def distribution_plot(of: Distribution) -> bytes:
@@ -147,24 +158,45 @@ def coverage_plot(classes: Sequence[ClassStatistics]) -> bytes:
 
 def sphere_plot(of: ClassStatistics) -> bytes:
     """Two globes in Hammer's projection: from where the object is seen by its true and by its canonical pose."""
+    figure, _ = _figure(3.4, 0.98, axes=False)
+    for column, (title, views) in enumerate((("true", of.views), ("canonical", of.views_canonical))):
+        counts = np.array(views)
+        _globe(figure.add_subplot(1, 2, column + 1), title, counts, counts > 0, max(1, int(counts.max())))
+    return _svg(figure)
+
+
+def detail_plot(views: Sequence[Sequence[int]], detail: DetailStatistics) -> bytes:
+    """A globe as in ``sphere_plot``: the share of the views from each cell that show the detail; and its scale."""
+    figure, _ = _figure(3.4, 0.98, axes=False)
+    counts = np.array(views)
+    shares = np.array(detail.views_visible) / np.maximum(counts, 1)
+    shown = _globe(figure.add_subplot(1, 2, 1), "detail visible", shares, counts > 0, 1.0)
+    beside = figure.add_subplot(1, 2, 2)
+    beside.set_axis_off()
+    bar = figure.colorbar(
+        shown, cax=beside.inset_axes((0.1, 0.5, 0.8, 0.1)), orientation="horizontal", ticks=[0, 0.5, 1]
+    )
+    bar.ax.set_xticklabels(["never", "half", "always"], fontsize=7)
+    bar.ax.tick_params(length=2)
+    bar.outline.set_edgecolor(_LINE)
+    return _svg(figure)
+
+
+def _globe(axes: Axes, title: str, values: NDArray[Any], shown: NDArray[np.bool_], most: float) -> PolyCollection:
+    """Cells of the viewing sphere coloured by values (BANDS, SECTORS) from 0 to ``most``, if they are to be shown."""
     from matplotlib.collections import PolyCollection
     from matplotlib.patches import Ellipse
 
-    figure, _ = _figure(3.4, 0.98, axes=False)
-    cells = cell_outlines().reshape(CELLS, -1, 2)
-    for column, (title, views) in enumerate((("true", of.views), ("canonical", of.views_canonical))):
-        axes = figure.add_subplot(1, 2, column + 1)
-        counts = np.array(views).ravel()
-        seen = counts > 0
-        shown = PolyCollection(list(cells[seen]), cmap="viridis_r", edgecolors="face", linewidths=0.2)
-        shown.set_array(counts[seen])
-        shown.set_clim(0, max(1, int(counts.max())))
-        axes.add_collection(shown)
-        axes.add_patch(Ellipse((0, 0), 4 * np.sqrt(2), 2 * np.sqrt(2), fill=False, edgecolor=_LINE, linewidth=0.8))
-        axes.set(xlim=(-2.9, 2.9), ylim=(-1.47, 1.47), aspect="equal")
-        axes.set_axis_off()
-        axes.set_title(title, fontsize=7, pad=1)
-    return _svg(figure)
+    cells, chosen = cell_outlines().reshape(CELLS, -1, 2), shown.ravel()
+    drawn = PolyCollection(list(cells[chosen]), cmap="viridis_r", edgecolors="face", linewidths=0.2)
+    drawn.set_array(values.ravel()[chosen])
+    drawn.set_clim(0, most)
+    axes.add_collection(drawn)
+    axes.add_patch(Ellipse((0, 0), 4 * np.sqrt(2), 2 * np.sqrt(2), fill=False, edgecolor=_LINE, linewidth=0.8))
+    axes.set(xlim=(-2.9, 2.9), ylim=(-1.47, 1.47), aspect="equal")
+    axes.set_axis_off()
+    axes.set_title(title, fontsize=7, pad=1)
+    return drawn
 
 
 def _short(name: str) -> str:

@@ -312,6 +312,14 @@ def uniform_coverage(views: int) -> float:
     return float(1 - (1 - 1 / CELLS) ** views)
 
 
+def cell_centres() -> Floats:
+    """(BANDS, SECTORS, 3) a unit vector in the middle of each cell."""
+    z = ((np.arange(BANDS) + 0.5) / BANDS * 2 - 1)[:, None]
+    longitude = (np.arange(SECTORS) + 0.5) / SECTORS * 2 * np.pi - np.pi
+    x, y = (np.sqrt(1 - z**2) * component for component in (np.cos(longitude), np.sin(longitude)))
+    return np.stack([x, y, np.broadcast_to(z, x.shape)], axis=-1)
+
+
 def cell_outlines(points: int = 6) -> Floats:
     """(BANDS, SECTORS, 4 * points, 2) outlines of the cells in Hammer's equal-area projection, within an ellipse of
     half axes 2 sqrt(2) and sqrt(2)."""

@@ -13,7 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from synthetless.dataset.labels import box_corners_mm
-from synthetless.dataset.layout import CAMERA_FILE, PREVIEW_FOLDER, find_models_folder, refuse_target
+from synthetless.dataset.layout import AMBIGUITY_FILE, CAMERA_FILE, PREVIEW_FOLDER, find_models_folder, refuse_target
 from synthetless.dataset.reader import Dataset, Image, Scene, read_specs
 from synthetless.dataset.records import ImageSpec, ModelInfo, read_scene_json
 from synthetless.errors import UserError
@@ -23,6 +23,7 @@ from synthetless.io.parallel import processes
 from synthetless.preview.image import ImageTask, write_image
 from synthetless.preview.pages import PAGE_FILE, refuse_others, write_pages, write_statistics
 from synthetless.preview.statistics import statistics
+from synthetless.symmetry import SymmetryTable
 
 _BATCH = 16  # images that a worker takes at a time
 _LARGEST_MM = 1e9  # of a diameter that can be drawn
@@ -74,6 +75,7 @@ class _Source:
         dataset: the split.
         images: number of images in each scene folder, by scene id.
         infos: models_info.json.
+        symmetries: symmetries.json of a dataset that ``ambiguity`` has judged.
         size_px: width and height of the images, if camera.json says them.
         limit: how many images to show at most; None for all.
     """
@@ -81,13 +83,15 @@ class _Source:
     dataset: Dataset
     images: Mapping[int, int]
     infos: Mapping[int, ModelInfo]
+    symmetries: SymmetryTable | None
     size_px: tuple[int, int] | None
     limit: int | None
 
     @classmethod
     def of(cls, dataset: Dataset, limit: int | None) -> _Source:
         images = {i: len(read_scene_json(dataset.paths(i).scene_gt)) for i in dataset.scene_ids}
-        return cls(dataset, images, dataset.models_info, _size_px(dataset.root / CAMERA_FILE), limit)
+        symmetries = dataset.symmetries if (dataset.root / AMBIGUITY_FILE).exists() else None
+        return cls(dataset, images, dataset.models_info, symmetries, _size_px(dataset.root / CAMERA_FILE), limit)
 
     @property
     def total(self) -> int:
@@ -122,7 +126,7 @@ class _Source:
             spec = recorded.get(image.im_id)
             if spec is not None and not _fits(spec, image):
                 raise UserError(f"{scene.paths.scene_spec}: image {image.im_id} is not the one of scene_gt.json")
-            yield ImageTask(image, spec, self.infos, self.size_px, to)
+            yield ImageTask(image, spec, self.infos, self.symmetries, self.size_px, to)
 
     def _check_object(self, scene: Scene, obj_id: int) -> None:
         """An object is drawn by its box and its diameter."""

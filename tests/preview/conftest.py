@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +12,10 @@ from typing import Any
 import pytest
 from valid_dataset import write_dataset, write_models
 
+from synthetless.dataset.ambiguity import write_ambiguity
 from synthetless.dataset.layout import DATASET_FILE, ScenePaths, scene_ids
 from synthetless.dataset.reader import ImageEntries, read_entries
+from synthetless.dataset.relabel import relabel
 from synthetless.preview import write_preview
 from tests.preview import chromium
 
@@ -59,6 +62,23 @@ def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def small_preview(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of its preview."""
     return write_preview(small_dataset, tmp_path_factory.mktemp("preview") / "a folder #1 of 100%")
+
+
+@pytest.fixture(scope="session")
+def judged_dataset(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small dataset, its cylinder taken for one without symmetries, and judged by ``ambiguity``."""
+    root = tmp_path_factory.mktemp("judged") / "dataset"
+    shutil.copytree(small_dataset, root)
+    (root.parent / "table.yaml").write_text("{2: {group: C1, quasi: SO(2)}, 3: {group: C2, quasi: D2}}")
+    relabel(root, root.parent / "table.yaml", workers=1)
+    write_ambiguity(root, with_poses=True, workers=1)
+    return root
+
+
+@pytest.fixture(scope="session")
+def judged_preview(judged_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of its preview."""
+    return write_preview(judged_dataset, tmp_path_factory.mktemp("preview of judged") / "pages", workers=1)
 
 
 @pytest.fixture(scope="session")

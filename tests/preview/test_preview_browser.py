@@ -111,6 +111,28 @@ def test_overlays_switch_by_mouse_and_by_key(open_page: Any, keys: list[str], tm
     assert not _css(open_page, "#drawing [data-overlay]")
 
 
+def test_poses_that_look_alike_are_drawn_faintly(
+    browser: Any, judged_preview: Path, small_preview: Path, keys: list[str]
+) -> None:
+    browser.get(judged_preview.as_uri())
+    _open(browser, keys[0], overlays=" ")
+    layer, box = "#drawing [data-overlay='alike'] line", "#overlays input[name='alike']"
+    assert not _css(browser, layer)
+    _css(browser, box)[0].click()
+    many = len(_css(browser, layer))
+    told = [cell.text for cell in _css(browser, "#instances tbody td:nth-child(7)")]
+    ghosts = sum(int(text.split(" of ")[0]) - 1 for text in told if text)
+    assert many == 15 * ghosts > 0  # a box and three axes
+    assert float(_css(browser, layer)[0].value_of_css_property("stroke-opacity")) < 0.5
+    _press(browser, "a")
+    assert not _css(browser, layer)
+    assert console(browser) == []
+    browser.get(small_preview.as_uri())
+    _open(browser, keys[0])
+    assert not _css(browser, box)[0].is_displayed()
+    assert len(_css(browser, "#instances tbody tr:first-child td")) == 5
+
+
 def test_words_are_object_regressor_and_margin(open_page: Any, small_preview: Path, keys: list[str]) -> None:
     _open(open_page, keys[0], overlays="ids regressor margin")
     words = {text.text.split(" · ")[1] for text in _css(open_page, "#drawing text")}

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from trees import contents
 
+from synthetless.dataset import Dataset
 from synthetless.dataset.labels import BOX_EDGES, box_corners_mm
 from synthetless.io.files import read_bytes
 from synthetless.io.images import decode_mask, decode_rgb
@@ -63,6 +64,26 @@ def test_canonical_boxes_are_drawn_where_the_labels_put_their_corners(small_prev
             corners = np.array(label["bbox3d_corners_2d"])
             expected = np.array([[corners[a], corners[b]] for a, b in BOX_EDGES])
             np.testing.assert_allclose(ends, expected, atol=0.051)
+
+
+def test_poses_that_look_alike_are_drawn_where_the_dataset_has_them(judged_preview: Path, judged_dataset: Path) -> None:
+    drawn, infos = 0, Dataset.open(judged_dataset).models_info
+    for image in Dataset.open(judged_dataset):
+        shown = _detail(judged_preview, f"{image.paths.root.name}/{image.im_id:06d}")["instances"]
+        for instance, of in zip(image.instances, shown, strict=True):
+            assert of["cosets"] == {1: 0, 2: 24, 3: 2}[instance.obj_id]
+            if instance.quasi is None or instance.quasi.R_alike is None or instance.quasi.t_alike is None:
+                assert of["alike"] == []
+                continue
+            assert len(of["alike"]) == np.count_nonzero(instance.quasi.alike) - 1
+            corners = box_corners_mm(infos[instance.obj_id])
+            poses = zip(instance.quasi.R_alike, instance.quasi.t_alike, strict=True)
+            expected = [box_lines(image.K, R, t, corners) for R, t in poses]
+            assert all(ghost["box"] in expected and ghost["box"] != of["true"]["box"] for ghost in of["alike"])
+            drawn += len(of["alike"])
+    assert drawn > 100
+    plots = {path.name for path in (judged_preview.parent / "plots").glob("detail_*")}
+    assert plots == {"detail_2.svg", "detail_3.svg"}
 
 
 def test_outlines_fill_what_the_masks_cover(small_preview: Path, small_dataset: Path) -> None:

@@ -15,7 +15,10 @@ synthetless.viewer = {
     ["ids", "Object ids"],
     ["regressor", "Regressor index"],
     ["margin", "Margin to the next jump"],
+    ["alike", "Other poses that look alike"],
   ],
+  KEYS: "123456789a",
+  AXES: ["x-axis", "y-axis", "z-axis"],
   WORDS: ["ids", "regressor", "margin"],
   AT_FIRST: "visible canonical-box ids",
   VIEWS: { rgb: ["Image", "i"], depth: ["Depth", "d"], normals: ["Normals", "n"] },
@@ -29,7 +32,7 @@ synthetless.viewer = {
     const boxes = this.OVERLAYS.map(([name, title], at) => {
       const box = element("input", { type: "checkbox", name, value: name });
       box.addEventListener("change", () => this.toggle(name));
-      return element("label", {}, box, element("span", {}, title), element("kbd", { "aria-hidden": "true" }, String(at + 1)));
+      return element("label", {}, box, element("span", {}, title), element("kbd", { "aria-hidden": "true" }, this.KEYS[at]));
     });
     document.getElementById("overlays").append(...boxes);
     document.getElementById("back").addEventListener("click", () => this.close());
@@ -95,7 +98,10 @@ synthetless.viewer = {
     this.drawing.style.setProperty("--ratio", width / height);
     const picture = view && svg("image", { href: detail.views[view], x: -0.5, y: -0.5, width, height });
     const chosen = this.overlays();
-    for (const box of document.querySelectorAll("#overlays input")) box.checked = chosen.has(box.name);
+    for (const box of document.querySelectorAll("#overlays input")) {
+      box.checked = chosen.has(box.name);
+      if (box.name === "alike") box.parentElement.hidden = !detail.instances.some((instance) => instance.cosets);
+    }
     const words = this.WORDS.filter((name) => chosen.has(name));
     const layers = [...this.OVERLAYS.map(([name]) => name).filter((name) => !this.WORDS.includes(name)), "words"];
     const groups = layers
@@ -120,10 +126,11 @@ synthetless.viewer = {
       const d = instance.outlines[name];
       return d ? [svg("path", { ...common, d, class: name })] : [];
     }
+    const lines = (of, pose, what) => of[what].map(([x1, y1, x2, y2], at) =>
+      svg("line", { ...common, x1, y1, x2, y2, class: [pose, what === "axes" ? this.AXES[at] : "box"].join(" ") }));
+    if (name === "alike") return instance.alike.flatMap((ghost) => [...lines(ghost, name, "box"), ...lines(ghost, name, "axes")]);
     const [pose, what] = name.split("-");
-    const kinds = what === "axes" ? ["x-axis", "y-axis", "z-axis"] : [];
-    return instance[pose][what].map(([x1, y1, x2, y2], at) =>
-      svg("line", { ...common, x1, y1, x2, y2, class: [pose, kinds[at] ?? "box"].join(" ") }));
+    return lines(instance[pose], pose, what);
   },
 
   words(instance, chosen, size) {
@@ -148,6 +155,8 @@ synthetless.viewer = {
 
   drawTable(detail) {
     const { element } = synthetless;
+    const judged = detail.instances.some((instance) => instance.cosets);
+    document.querySelector("#instances .alike").hidden = !judged;
     const rows = detail.instances.map((instance) => {
       const dot = element("span", { class: "dot" });
       dot.style.backgroundColor = synthetless.colour(instance.obj);
@@ -155,9 +164,10 @@ synthetless.viewer = {
       const swatch = element("span", words ? { class: "swatch", title: words, role: "img", "aria-label": words } : {});
       if (colour) swatch.style.backgroundColor = colour;
       const margin = instance.margin >= 180 ? "none" : `${instance.margin.toFixed(1)}°`;
+      const alike = instance.cosets ? `${instance.alike.length + 1} of ${instance.cosets}` : "";
       const cells = [
         `${(100 * instance.visib).toFixed(0)} %`, `${instance.regressor} of ${instance.regressors}`, margin,
-        `${instance.distance.toFixed(0)} mm`, swatch,
+        `${instance.distance.toFixed(0)} mm`, swatch, ...(judged ? [alike] : []),
       ];
       const row = element("tr", { tabindex: "0" },
         element("th", { scope: "row" }, dot, synthetless.className(instance.obj)), ...cells.map((cell) => element("td", {}, cell)));
@@ -201,7 +211,7 @@ synthetless.viewer = {
     if (document.getElementById("viewer").hidden || document.getElementById("help").open) return;
     if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input[type=number], select")) return;
     const views = Object.entries(this.VIEWS).map(([view, [, letter]]) => [letter, () => synthetless.change({ view })]);
-    const toggles = this.OVERLAYS.map(([name], at) => [String(at + 1), () => this.toggle(name)]);
+    const toggles = this.OVERLAYS.map(([name], at) => [this.KEYS[at], () => this.toggle(name)]);
     const actions = {
       Escape: () => this.close(),
       ArrowLeft: () => this.step(-1),
