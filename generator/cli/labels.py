@@ -75,6 +75,12 @@ def ambiguity_command(
     models: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder of its models, if they are not in the dataset.")
     ] = None,
+    symmetries: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Symmetry table of the larger groups; they are put into symmetries.json, labels stay."
+        ),
+    ] = None,
     poses: Annotated[bool, typer.Option("--poses", help="Also write the poses themselves that look alike.")] = False,
     workers: Workers = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the counts as JSON.")] = False,
@@ -84,8 +90,10 @@ def ambiguity_command(
     For objects with a quasi-symmetry group. Images are not looked at: poses and meshes decide. Called again, it goes on
     where it was interrupted.
     """
-    from synthetless.dataset.ambiguity import write_ambiguity
+    from synthetless.dataset.ambiguity import name_quasi_symmetries, write_ambiguity
 
+    if symmetries is not None:
+        name_quasi_symmetries(dataset, symmetries, models, workers)
     done = write_ambiguity(dataset, what, eps_mm, models, poses, workers)
     say(json.dumps(asdict(done)) if as_json else done)
 

@@ -8,9 +8,10 @@ was killed meanwhile, the next call goes on with the folders that lack theirs.
 from __future__ import annotations
 
 import json
+import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import groupby
 from pathlib import Path
@@ -35,6 +36,7 @@ from synthetless.dataset.layout import (
 )
 from synthetless.dataset.reader import Scene, digest, read_recipe, read_specs
 from synthetless.dataset.records import AmbiguityEntry, ImageSpec
+from synthetless.dataset.relabel import adopt, relabel
 from synthetless.errors import UserError
 from synthetless.io.files import locked, read_bytes, read_json, remove_file, replace_file, write_json
 from synthetless.io.models import ObjectModel, load_models, read_models_info
@@ -42,6 +44,7 @@ from synthetless.io.parallel import each
 from synthetless.scenes.spec import Intrinsics, Role
 from synthetless.symmetry import SymmetryTable
 from synthetless.symmetry.ambiguity import MIN_PIXELS, Ambiguity, Cosets, Resolution, What, see
+from synthetless.symmetry.table import QuasiSymmetry, SymmetryEntry
 
 _IMAGES_A_TASK = 25
 _POSE_SAMPLES = 72
@@ -137,6 +140,61 @@ def write_ambiguity(
     return _summary(source, scenes, len(wanted))
 
 
+def name_quasi_symmetries(root: Path, symmetries: Path, models: Path | None = None, workers: int | None = None) -> None:
+    """Put quasi-symmetry groups into a labelled dataset's symmetries.json. Its labels are those of the exact groups, so
+    they stay as they are.
+
+    Args:
+        root: the dataset's folder.
+        symmetries: a symmetry table, which may lack objects. An object's quasi-symmetry group is the entry's ``quasi``,
+            or, where it has none, its group.
+        models: folder of the models, if they are not in the dataset.
+        workers: as in ``write_ambiguity``.
+
+    Raises:
+        UserError: there are no labels, or the table is invalid, of other objects or of another exact group.
+    """
+    table = _symmetries(root)
+    entries = dict(table.entries)
+    for obj_id, given in SymmetryTable.read(symmetries).entries.items():
+        if obj_id not in entries:
+            known = ", ".join(map(str, entries))
+            raise UserError(f"{symmetries}: object {obj_id} is none of the dataset's objects {known}")
+        try:
+            entries[obj_id] = _with_quasi(entries[obj_id], given)
+        except UserError as error:
+            raise UserError(f"{symmetries}: object {obj_id}: {error}") from None
+    if entries == dict(table.entries):
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / SYMMETRIES_FILE
+        replace(table, entries=entries).write(path)
+        if (root / DATASET_FILE).exists():
+            relabel(root, path, workers=workers)
+        else:
+            adopt(root, models, path, workers=workers)
+
+
+def _with_quasi(entry: SymmetryEntry, given: SymmetryEntry) -> SymmetryEntry:
+    is_same = entry.group.contains(given.group) and given.group.contains(entry.group)
+    if given.quasi is None:
+        return entry if is_same else replace(entry, quasi=QuasiSymmetry(given.group))
+    if not is_same:
+        raise UserError(
+            f"the group is {given.group.name}, but the labels are of {entry.group.name}: relabel first, or leave the "
+            "group as it is"
+        )
+    return replace(entry, quasi=given.quasi)
+
+
+def _symmetries(root: Path) -> SymmetryTable:
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder; give that of a dataset")
+    if not (root / SYMMETRIES_FILE).exists():
+        raise UserError(f"{root}: holds no {SYMMETRIES_FILE}; adopt labels a BOP dataset and writes it")
+    return SymmetryTable.read(root / SYMMETRIES_FILE)
+
+
 @dataclass(frozen=True, eq=False)
 class AmbiguitySource:
     """What all images are judged by; travels to the worker processes.
@@ -171,15 +229,11 @@ class AmbiguitySource:
         with_poses: bool = False,
     ) -> AmbiguitySource:
         """Find everything that a dataset's images are judged by; errors as in ``write_ambiguity``."""
-        if not root.is_dir():
-            raise UserError(f"{root}: no such folder; give that of a dataset")
-        if not (root / SYMMETRIES_FILE).exists():
-            raise UserError(f"{root}: holds no {SYMMETRIES_FILE}; adopt labels a BOP dataset and writes it")
-        table = SymmetryTable.read(root / SYMMETRIES_FILE)
+        table = _symmetries(root)
         if not any(entry.quasi for entry in table.entries.values()):
             raise UserError(
-                f"{root / SYMMETRIES_FILE}: no object has a quasi-symmetry group; relabel or adopt with a table that "
-                "has one, such as 'object 14: {group: C1, quasi: {group: SO(2), axis: [0, 0, 1]}}'"
+                f"{root / SYMMETRIES_FILE}: no object has a quasi-symmetry group; give a table that names one by "
+                "--symmetries, such as 'object 14: {group: C1, quasi: {group: SO(2), axis: [0, 0, 1]}}'"
             )
         resolution = Resolution(what, eps_mm)
         folder = models or find_models_folder(root)

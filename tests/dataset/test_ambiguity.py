@@ -22,7 +22,7 @@ from synthetless.annotation.raycast import RayCaster
 from synthetless.cli.commands import app
 from synthetless.dataset import Dataset
 from synthetless.dataset import ambiguity as module
-from synthetless.dataset.ambiguity import AmbiguitySource, see_images, write_ambiguity
+from synthetless.dataset.ambiguity import AmbiguitySource, name_quasi_symmetries, see_images, write_ambiguity
 from synthetless.dataset.reader import Scene
 from synthetless.dataset.relabel import adopt, relabel
 from synthetless.errors import UserError
@@ -248,8 +248,12 @@ def test_datasets_of_others(root: Path, tmp_path: Path) -> None:
         folder = root / "train_synthetless" / scene
         for name in (FILE, "scene_spec.jsonl", "scene_gt_canonical.json"):
             (folder / name).unlink()
+    (tmp_path / "exact.yaml").write_text("{1: C1, 3: C2}")
     (tmp_path / "table.yaml").write_text(TABLE)
-    adopt(root, symmetries=tmp_path / "table.yaml", workers=1)
+    adopt(root, symmetries=tmp_path / "exact.yaml", workers=1)
+    labels = {path: text for path, text in contents(root).items() if not path.endswith("symmetries.json")}
+    name_quasi_symmetries(root, tmp_path / "table.yaml", workers=1)
+    assert labels.items() <= contents(root).items()
     with pytest.raises(UserError, match="not found; a BOP models folder"):
         write_ambiguity(root, models=tmp_path, workers=1)
     write_ambiguity(root, with_poses=True, workers=1)
@@ -349,6 +353,29 @@ def test_the_command(root: Path) -> None:
     assert "object 3: C2 in D2; the detail that separates them is visible in 0 of" in done.output
     told = CliRunner().invoke(app, ["ambiguity", str(root), "--workers", "1", "--json", "--what", "silhouette"])
     assert json.loads(told.output)["made"] == 2
+
+
+def test_larger_groups_are_given_by_a_table_and_labels_stay(
+    valid: Path, judged: Path, tmp_path: Path, small_scene_folders: None
+) -> None:
+    root = Path(shutil.copytree(valid, tmp_path / "d"))
+    (tmp_path / "table.yaml").write_text(
+        "{1: {group: C1, quasi: {group: C2, axis: [0, 0, 1], tolerance_mm: 60}}, 2: O(2), 3: D2}"
+    )
+    command = ["ambiguity", str(root), "--symmetries", str(tmp_path / "table.yaml"), "--workers", "1"]
+    done = CliRunner().invoke(app, [*command, "--poses"])
+    assert done.exit_code == 0, done.output
+    assert contents(root) == contents(judged)
+    assert validate(root, workers=1).valid
+    for text, message in (
+        ("{1: {group: C3, quasi: D3}}", "the group is C3, but the labels are of C1"),
+        ("{2: C4}", "does not contain the group"),
+        ("{9: C4}", "object 9 is none of the dataset's objects 1, 2, 3"),
+    ):
+        (tmp_path / "table.yaml").write_text(text)
+        with pytest.raises(UserError, match=message):
+            name_quasi_symmetries(root, tmp_path / "table.yaml")
+    assert contents(root) == contents(judged)
 
 
 @pytest.mark.parametrize(
