@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from synthetless.dataset.labels import BOX_EDGES
 from synthetless.dataset.reader import Dataset, Image, Instance
 from synthetless.errors import UserError
 from synthetless.io.files import atomic_write, read_bytes, read_json
 from synthetless.io.images import decode_rgb, encode_png
+from synthetless.io.models import BOX_EDGES
 from synthetless.learning.data import picture, sample_of
 from synthetless.learning.detector import Detections, Detector
 from synthetless.learning.fit import CHECKPOINT_FILE, load, load_weights

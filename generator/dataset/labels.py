@@ -16,12 +16,10 @@ from synthetless.dataset.reader import ScenePoses, as_floats
 from synthetless.dataset.records import CameraEntry, CanonicalEntry, GtEntry, ModelInfo
 from synthetless.errors import UserError
 from synthetless.io.files import is_locked
+from synthetless.io.models import box_corners
 from synthetless.symmetry import CanonicalMap, CanonicalPoses, SymmetryTable
 
 Floats = NDArray[np.float64]
-
-BOX_EDGES = tuple((i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if not i & bit)
-"""The 12 edges of ``box_corners_mm``, as pairs of corners that differ along one axis."""
 
 
 def label_scene(
@@ -149,7 +147,7 @@ def _stamps(root: Path) -> list[tuple[int, int] | None]:
 
 
 def box_corners_mm(info: ModelInfo) -> Floats:
-    """(8, 3) corners of the box of a models_info.json entry, model frame; x varies slowest, z fastest.
+    """(8, 3) corners of the box of a models_info.json entry, model frame, in ``box_corners``' order.
 
     Raises:
         UserError: the entry has no box.
@@ -157,8 +155,8 @@ def box_corners_mm(info: ModelInfo) -> Floats:
     sides = [as_floats([info.get(f"{what}_{axis}") for axis in "xyz"]) for what in ("min", "size")]
     if not all(side.shape == (3,) and np.isfinite(side).all() for side in sides):
         raise UserError("the box needs the numbers min_x, min_y, min_z, size_x, size_y, size_z")
-    choice = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
-    return sides[0] + choice * sides[1]
+    low, size = sides
+    return box_corners(low, low + size)
 
 
 def project(K: Floats, poses: CanonicalPoses, points_mm: Floats) -> Floats:

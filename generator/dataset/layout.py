@@ -15,15 +15,16 @@ from pathlib import Path
 from synthetless.config import SPLIT
 from synthetless.errors import UserError
 from synthetless.io.models import INFO_FILE
+from synthetless.symmetry.table import TABLE_FILE
 
 DATASET_FILE = "dataset.json"
-SYMMETRIES_FILE = "symmetries.json"
-PENDING_FILE = ".symmetries.json"
+SYMMETRIES_FILE = TABLE_FILE
+PENDING_FILE = f".{SYMMETRIES_FILE}"
 """While labels are being replaced: the symmetry table that the new ones are of."""
 CAMERA_FILE = "camera.json"
 AMBIGUITY_FILE = "ambiguity.json"
 """What the scene folders' scene_gt_ambiguity.json are of."""
-PENDING_AMBIGUITY_FILE = ".ambiguity.json"
+PENDING_AMBIGUITY_FILE = f".{AMBIGUITY_FILE}"
 """The same while they are being made."""
 DRAFT_FOLDER = ".relabel.draft"
 """New labels, until all of them are made."""

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetless.dataset.labels import BOX_EDGES
 from synthetless.dataset.layout import ScenePaths, scene_ids
 from synthetless.dataset.reader import Image, Scene
 from synthetless.errors import UserError
 from synthetless.io import images
 from synthetless.io.files import atomic_write
+from synthetless.io.models import BOX_EDGES
 
 Pixels = NDArray[np.uint8]
 Color = tuple[int, int, int]

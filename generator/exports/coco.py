@@ -17,7 +17,7 @@ from pycocotools import mask as coco_mask
 from tqdm import tqdm
 from typing_extensions import TypedDict
 
-from synthetless.dataset.labels import BOX_EDGES, refuse_half_labelled
+from synthetless.dataset.labels import refuse_half_labelled
 from synthetless.dataset.layout import ScenePaths, find_split, refuse_target, scene_ids
 from synthetless.errors import UserError
 from synthetless.exports.annotated import (
@@ -34,6 +34,7 @@ from synthetless.exports.annotated import (
 )
 from synthetless.exports.outlines import border_polygons
 from synthetless.io.files import atomic_file, remove_drafts
+from synthetless.io.models import BOX_EDGES
 
 BoxKind = Literal["visible", "amodal"]
 

@@ -51,10 +51,8 @@ class ObjectModel:
 
     @property
     def box_corners_mm(self) -> NDArray[np.float64]:
-        """(8, 3) corners of the axis-aligned box of the vertices; x varies slowest, z fastest."""
-        low, high = self.vertices_mm.min(axis=0), self.vertices_mm.max(axis=0)
-        choice = np.array([[(i >> 2) & 1, (i >> 1) & 1, i & 1] for i in range(8)], dtype=bool)
-        return np.where(choice, high, low)
+        """(8, 3) corners of the axis-aligned box of the vertices, in ``box_corners``' order."""
+        return box_corners(self.vertices_mm.min(axis=0), self.vertices_mm.max(axis=0))
 
     @property
     def digest(self) -> str:
@@ -66,6 +64,16 @@ class ObjectModel:
         if self.is_verbatim:
             return self.path.read_bytes()
         return TriangleMesh(self.vertices_mm, self.faces.astype(np.int64), self.is_verbatim).to_ply()
+
+
+def box_corners(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(8, 3) corners of the box between two points (3,); x varies slowest, z fastest."""
+    is_high = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], dtype=bool)
+    return np.where(is_high, high, low)
+
+
+BOX_EDGES = tuple((i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if not i & bit)
+"""The 12 edges of ``box_corners``, as pairs of corners that differ along one axis."""
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetless.dataset.labels import BOX_EDGES, box_corners_mm
+from synthetless.dataset.labels import box_corners_mm
 from synthetless.dataset.layout import CAMERA_FILE
 from synthetless.dataset.reader import Image, Instance, Visibility
 from synthetless.dataset.records import ImageSpec, ModelInfo
 from synthetless.errors import UserError
 from synthetless.io import images
 from synthetless.io.files import atomic_write, read_bytes
+from synthetless.io.models import BOX_EDGES
 from synthetless.scenes.spec import Material, PlaneSpec, RoomSpec, SensorSpec, Vector, View
 from synthetless.scenes.srgb import srgb_from_linear
 from synthetless.scenes.textures import PhotoTexture

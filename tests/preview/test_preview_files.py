@@ -16,9 +16,10 @@ from hypothesis.extra import numpy as hnp
 from trees import contents
 
 from synthetless.dataset import Dataset
-from synthetless.dataset.labels import BOX_EDGES, box_corners_mm
+from synthetless.dataset.labels import box_corners_mm
 from synthetless.io.files import read_bytes
 from synthetless.io.images import decode_mask, decode_rgb
+from synthetless.io.models import BOX_EDGES
 from synthetless.preview import write_preview
 from synthetless.preview.image import box_lines, outline
 from tests.preview.conftest import HOSTILE_NAME, images_of
