@@ -138,7 +138,7 @@ def _objects(seen: Observations, recipe: Recipe) -> Iterator[Distribution]:
     named = {str(n): dropped[n] for n in sizes}
     weights = {str(n): float(low <= n <= high) for n in sizes}
     yield _categories("objects_per_drop", "objects", "Objects dropped", named, weights, f"each of {low} to {high}")
-    if recipe.release.container != ContainerSettings():
+    if recipe.release.container != ContainerSettings() or any(spec.container is not None for spec in seen.drops):
         yield _containers(seen, recipe)
     yield _release(items)
     if recipe.objects.tint == 0:

@@ -315,6 +315,20 @@ def test_distractors_hide(tmp_path: Path, parts: Path, small_scene_folders: None
     assert all(entry["view_ambiguity"] == 1 for entry in entries(root))
 
 
+def test_a_box_hides(tmp_path: Path, parts: Path, small_scene_folders: None) -> None:
+    """The same objects with and without one: behind its sides no pixel tells poses apart."""
+    (tmp_path / "table.yaml").write_text(TABLE)
+    sides = ("release.container.box.sides_m=[0.13, 0.14]", "release.container.box.height_m=[0.1, 0.15]")
+    apart = []
+    for name, overrides in (("open", ()), ("boxed", ("release.container=box", *sides))):
+        valid_dataset.write_dataset(tmp_path / name, parts, overrides)
+        relabel(tmp_path / name, tmp_path / "table.yaml", workers=1)
+        write_ambiguity(tmp_path / name, workers=1)
+        apart.append([sum(entry["pixels_apart"]) for entry in entries(tmp_path / name)])
+    assert len(apart[0]) == len(apart[1])
+    assert sum(apart[1]) < 0.9 * sum(apart[0])
+
+
 def test_exports(root: Path, tmp_path: Path, small_scene_folders: None) -> None:
     export_coco(root, tmp_path / "coco.json")
     coco = COCO(str(tmp_path / "coco.json"))

@@ -21,6 +21,7 @@ from synthetless.io.images import decode_rgb
 from synthetless.preview.distributions import Distribution, Observations, distributions, labelled_classes
 from synthetless.preview.statistics import NEAR_JUMP_DEG, statistics
 from synthetless.scenes.sampling import Catalogue, sample_scene
+from synthetless.scenes.spec import Standing
 from synthetless.symmetry import SymmetryTable
 from tests.preview.conftest import images_of
 
@@ -31,13 +32,15 @@ MATPLOTLIB = "matplotlib is not installed"
 
 def _seen(recipe: Recipe, drops: int = DROPS, seed: int = 4) -> Observations:
     """What a dataset of a recipe would say, if every object were seen in the pose it is released in."""
-    catalogue = Catalogue(dict.fromkeys(recipe.objects.ids or IDS, 0.06), {})
+    ids = recipe.objects.ids or IDS
+    stands = dict.fromkeys(ids, Standing(False, 0.02, 0.04, 0.03))
+    catalogue = Catalogue(dict.fromkeys(ids, 0.06), {}, standing=stands)
     scenes = [sample_scene(recipe, catalogue, seed, drop) for drop in range(drops)]
-    ids = np.array([item.obj_id for scene in scenes for item in scene.objects])
+    seen = np.array([item.obj_id for scene in scenes for item in scene.objects])
     return Observations(
-        obj_id=ids,
-        visib_fract=np.zeros(len(ids)),
-        distance_mm=np.full(len(ids), 700.0),
+        obj_id=seen,
+        visib_fract=np.zeros(len(seen)),
+        distance_mm=np.full(len(seen), 700.0),
         objects_per_image=np.array([len(scene.objects) for scene in scenes]),
         views=[scene.views[0] for scene in scenes],
         exposure_gains=np.ones(drops),
@@ -77,6 +80,7 @@ def test_what_the_recipe_draws_is_what_it_asked_for(by_default: Observations) ->
         ("light.strength=[0.3, 1.4]", "light_strength"),
         ("light.warmth=[0.1, 0.5]", "light_warmth"),
         ("light.ambient=[0.08, 0.4]", "ambient"),
+        ("release.container.tray.share=0.1", "containers"),
         ("table.tile_m=[0.3, 1.0]", "tile"),
         ("table.specular=[0.0, 0.1]", "table_specular"),
     ],
@@ -84,6 +88,16 @@ def test_what_the_recipe_draws_is_what_it_asked_for(by_default: Observations) ->
 def test_a_dataset_of_another_recipe_differs_there_and_nowhere_else(override: str, key: str) -> None:
     found = _verdicts(_seen(load_recipe(None, [override]), drops=500), Recipe())
     assert {name for name, each in found.items() if each.verdict == "differs"} == {key}
+
+
+def test_containers_come_by_their_shares_and_what_is_set_down_is_not_taken_for_dropped() -> None:
+    recipe = load_recipe(None, ["release.container.box.share=0.3", "release.container.tray.share=0.1"])
+    upright = recipe.model_copy(update={"release": recipe.release.model_copy(update={"upright": 0.5})})
+    for asked in (recipe, upright):
+        found = _verdicts(_seen(asked, drops=500), asked)
+        assert {key for key, each in found.items() if each.verdict == "differs"} == set()
+        assert found["containers"].verdict == "as asked" and found["containers"].counts[0] > 200
+    assert found["release"].values < 0.7 * sum(found["classes"].counts)
 
 
 def test_release_rotations_that_are_not_uniform_are_found(by_default: Observations) -> None:
