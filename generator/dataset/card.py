@@ -16,9 +16,10 @@ import yaml
 from numpy.typing import NDArray
 
 from synthetless.config import BUILTIN, Recipe
-from synthetless.dataset.layout import CARD_FILE, DATASET_FILE, SYMMETRIES_FILE, ScenePaths, scene_ids
+from synthetless.dataset.layout import CARD_FILE, DATASET_FILE, MODELS_FOLDER, SYMMETRIES_FILE, ScenePaths, scene_ids
 from synthetless.dataset.reader import Scene, read_recipe
 from synthetless.io.files import atomic_write, read_json
+from synthetless.io.models import object_names, read_models_info
 from synthetless.symmetry import SymmetryTable
 
 _BUILTIN_LICENCE = "The built-in parts of SyntheT-Less, own work, CC0 1.0"
@@ -84,13 +85,14 @@ def write_card(dataset: Path) -> None:
     recipe = read_recipe(dataset)
     counts = _count(dataset, recipe.split)
     table = SymmetryTable.read(dataset / SYMMETRIES_FILE)
+    names = object_names(read_models_info(dataset / MODELS_FOLDER))
     licence = _licence(recipe)
     parts = [
         _front_matter(recipe, counts, licence),
         _what(recipe, counts, header),
         _contents(recipe, table),
         _making(recipe),
-        _objects(counts, table),
+        _objects(counts, table, names),
         _loading(recipe),
         _terms(recipe, licence),
     ]
@@ -224,13 +226,13 @@ def _visibility(delta_mm: float) -> str:
     return f"what is the nearest surface{behind}"
 
 
-def _objects(counts: Counts, table: SymmetryTable) -> str:
+def _objects(counts: Counts, table: SymmetryTable, names: Mapping[int, str]) -> str:
     rows = []
     for obj_id, of_object in counts.objects.items():
         shares = [count / of_object.instances for count in of_object.regressors]
         rows.append(
             (
-                str(obj_id),
+                f"{obj_id} {escape(names[obj_id])}" if obj_id in names else str(obj_id),
                 table.entries[obj_id].group.name if obj_id in table.entries else "",
                 str(of_object.instances),
                 f"{of_object.mean_visib_fract:.1%}",

@@ -470,7 +470,11 @@ def coco_image(im_id: int, rgb: Path, width: int, height: int) -> CocoImage:
 
 
 def scene_gt_coco(
-    dataset_name: str, obj_ids: Iterable[int], images: Iterable[CocoImage], annotations: Iterable[CocoAnnotation]
+    dataset_name: str,
+    obj_ids: Iterable[int],
+    images: Iterable[CocoImage],
+    annotations: Iterable[CocoAnnotation],
+    names: Mapping[int, str] | None = None,
 ) -> CocoFile:
     """The content of scene_gt_coco.json, for ``synthetless.io.files.write_json``.
 
@@ -479,11 +483,13 @@ def scene_gt_coco(
         obj_ids: every object of the dataset, whether it occurs or not.
         images: ``coco_image`` of every image.
         annotations: ``coco_annotations`` of the images, one after the other; they are numbered from 1.
+        names: of objects; one that has none is called by its id.
     """
     return {
         "annotations": [{**annotation, "id": number} for number, annotation in enumerate(annotations, start=1)],
         "categories": [
-            {"id": obj_id, "name": str(obj_id), "supercategory": dataset_name} for obj_id in sorted(set(obj_ids))
+            {"id": obj_id, "name": (names or {}).get(obj_id, str(obj_id)), "supercategory": dataset_name}
+            for obj_id in sorted(set(obj_ids))
         ],
         "images": list(images),
         "info": {"contributor": "", "description": dataset_name, "url": "", "version": "0.1.0"},

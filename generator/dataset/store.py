@@ -42,7 +42,7 @@ from synthetless.errors import UserError
 from synthetless.io import images
 from synthetless.io.color import exposure_gain, picture
 from synthetless.io.files import atomic_write, in_turn, read_json, replace_file, write_json, write_json_lines
-from synthetless.io.models import INFO_FILE, ObjectModel
+from synthetless.io.models import INFO_FILE, ObjectModel, object_names, read_models_info
 from synthetless.scenes.sampling import sample_sensor
 from synthetless.scenes.spec import Pose, SceneSpec, SensorSpec
 from synthetless.symmetry import SymmetryTable
@@ -218,7 +218,7 @@ class DatasetStore:
         shutil.rmtree(self.root / DRAFT_FOLDER, ignore_errors=True)  # of a relabelling that was killed
         header = read_json(self.root / DATASET_FILE)
         state = LabelState.read(self.root, header)
-        infos = {int(key): info for key, info in read_json(self.root / MODELS_FOLDER / INFO_FILE).items()}
+        infos = read_models_info(self.root / MODELS_FOLDER)
         for scene_id in self._recorded():
             changed_ns = self._records(scene_id).stat().st_mtime_ns
             known = self._assembled.get(scene_id)
@@ -285,6 +285,7 @@ class DatasetStore:
             infos,
             [records.coco_image(im_id, scene.rgb(im_id, extension), camera.width, camera.height) for im_id in made],
             [annotation for record in made.values() for annotation in record["coco"]],
+            object_names(infos),
         )
 
     def _write_companions(self, models: Mapping[int, ObjectModel]) -> None:

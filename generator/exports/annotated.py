@@ -13,11 +13,12 @@ from pycocotools import mask as coco_mask
 from pydantic import ConfigDict, Field, with_config
 from typing_extensions import TypedDict
 
-from synthetless.dataset.layout import DATASET_FILE, ScenePaths
+from synthetless.dataset.layout import DATASET_FILE, ScenePaths, find_models_folder
 from synthetless.dataset.reader import ImageEntries, read_entries
 from synthetless.dataset.records import Count, validated
 from synthetless.errors import UserError
 from synthetless.io.files import read_json
+from synthetless.io.models import object_names, read_models_info
 
 _OPEN = ConfigDict(extra="ignore", strict=True)
 _Side = Annotated[int, Field(ge=1, le=2**20)]
@@ -136,6 +137,15 @@ def decoded_mask(segmentation: Segmentation) -> NDArray[np.bool_]:
     """(H, W) mask of run lengths in either form."""
     mask: NDArray[np.bool_] = coco_mask.decode(compressed_rle(segmentation)).astype(bool)
     return mask
+
+
+def names_of(dataset: Path) -> dict[int, str]:
+    """What models_info.json or names.yaml calls the objects of a dataset, where its models are in its folder."""
+    try:
+        folder = find_models_folder(dataset)
+    except UserError:
+        return {}
+    return object_names(read_models_info(folder))
 
 
 def in_image(u: float, v: float, width: int, height: int) -> bool:

@@ -35,12 +35,12 @@ from synthetless.dataset.layout import (
 )
 from synthetless.dataset.records import MIN_VISIB_FRACT, read_scene_json
 from synthetless.errors import UserError
-from synthetless.exports.annotated import AnnotatedImage, annotated_images, read_scene_coco
+from synthetless.exports.annotated import AnnotatedImage, annotated_images, names_of, read_scene_coco
 from synthetless.exports.folder import Entry, FolderExport, Same, write_export
 from synthetless.exports.keypoints import farthest_points
 from synthetless.io.files import json_bytes, read_bytes, read_json
 from synthetless.io.images import decode_rgb, encode_jpeg
-from synthetless.io.models import INFO_FILE, ObjectModel, load_models
+from synthetless.io.models import INFO_FILE, ObjectModel, load_models, read_models_info
 from synthetless.scenes.spec import Intrinsics
 
 IMAGES_PER_SCENE = 1000
@@ -121,7 +121,7 @@ class BopExport(FolderExport):
                         yield f"{scene}/{folder}/{im_id:06d}_{gt_id:06d}.png", read_bytes(path)
             images.append({**image.entry, "id": im_id, "file_name": f"rgb/{im_id:06d}{rgb}"})
             annotations += [{**annotation, "image_id": im_id} for _, annotation in image.visible]
-            categories = {category["id"]: category for category in coco["categories"]} | categories
+            categories = {category["id"]: self._named(category) for category in coco["categories"]} | categories
             if self.xyz_crops:
                 yield from self._crops(f"{self.to_split}/{XYZ_FOLDER}/{part:06d}/{im_id:06d}", image)
         for name, content_of in files.items():
@@ -185,6 +185,14 @@ class BopExport(FolderExport):
         shifted[2], shifted[5] = shifted[2] + self.pixel_centre, shifted[5] + self.pixel_centre
         return shifted
 
+    def _named(self, category: Mapping[str, Any]) -> dict[str, Any]:
+        names = self._names
+        return {**category, **({"name": names[category["id"]]} if category["id"] in names else {})}
+
+    @cached_property
+    def _names(self) -> dict[int, str]:
+        return names_of(self.dataset)
+
     def _moved(self, label: Mapping[str, Any]) -> dict[str, Any]:
         corners = [[u + self.pixel_centre, v + self.pixel_centre] for u, v in label["bbox3d_corners_2d"]]
         return {**label, "bbox3d_corners_2d": corners}
@@ -210,8 +218,10 @@ class BopExport(FolderExport):
 
     def _model_files(self) -> Iterator[Entry]:
         folder = find_models_folder(self.dataset)
+        infos = {str(obj_id): info for obj_id, info in read_models_info(folder).items()}
+        yield _json_file(f"{MODELS_FOLDER}/{INFO_FILE}", infos)
         names = [INFO_FILE, *sorted(path.name for path in folder.glob("obj_*.ply"))]
-        for name in names:
+        for name in names[1:]:
             yield f"{MODELS_FOLDER}/{name}", read_bytes(folder / name)
         if self.fps:
             names.append(FPS_FILE)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, NotRequired
 
@@ -30,6 +30,7 @@ from synthetless.exports.annotated import (
     decoded_mask,
     in_image,
     licence_of,
+    names_of,
     read_scene_coco,
 )
 from synthetless.exports.outlines import border_polygons
@@ -127,14 +128,14 @@ def export_coco(
     refuse_target(dataset, to)
     _refuse_others(to)
     to = to.resolve()
-    licence = licence_of(dataset)
+    licence, names = licence_of(dataset), names_of(dataset)
     categories: dict[int, Any] = {}
     images: list[str] = []
     annotations: list[str] = []
     for scene_id in tqdm(scene_ids(dataset, split), desc="COCO", unit="scene", disable=None):
         scene = ScenePaths.of(dataset, scene_id, split)
         coco = read_scene_coco(scene)
-        categories |= {category["id"]: _with_corners(category) for category in coco["categories"]}
+        categories |= {category["id"]: _with_corners(category, names) for category in coco["categories"]}
         for image in annotated_images(scene, coco):
             image_id = len(images) + 1
             exported = _image(image, image_id, scene_id, scene, to)
@@ -233,8 +234,9 @@ def _keypoints(corners: list[list[float]], width: int, height: int) -> list[floa
     return flat
 
 
-def _with_corners(category: SceneCategory) -> dict[str, Any]:
-    return {**category, "keypoints": _CORNER_NAMES, "skeleton": _SKELETON}
+def _with_corners(category: SceneCategory, names: Mapping[int, str]) -> dict[str, Any]:
+    name = {"name": names[category["id"]]} if category["id"] in names else {}
+    return {**category, **name, "keypoints": _CORNER_NAMES, "skeleton": _SKELETON}
 
 
 def _json_parts(head: dict[str, Any], lists: dict[str, list[str]]) -> Iterator[str]:

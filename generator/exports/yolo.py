@@ -37,6 +37,7 @@ from synthetless.exports.annotated import (
     decoded_mask,
     in_image,
     licence_of,
+    names_of,
     read_scene_coco,
 )
 from synthetless.exports.folder import Entry, FolderExport, write_export
@@ -132,6 +133,7 @@ class YoloExport(FolderExport):
         for scene_id in scene_ids(self.dataset, self.split):
             for category in read_scene_coco(self._scene(scene_id))["categories"]:
                 categories[category["id"]] = str(category.get("name", category["id"]))
+        categories |= {obj_id: name for obj_id, name in names_of(self.dataset).items() if obj_id in categories}
         if self.classes == "object":
             return tuple(YoloClass(obj_id, None, name) for obj_id, name in sorted(categories.items()))
         table = SymmetryTable.read(self.dataset / SYMMETRIES_FILE)

@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synthetless.errors import UserError
-from synthetless.io.documents import shown
+from synthetless.io.documents import read_document, shown
 from synthetless.io.files import read_json
 from synthetless.io.meshes import SUFFIXES, TriangleMesh, read_mesh
 
 INFO_FILE = "models_info.json"
+NAMES_FILE = "names.yaml"
+"""What the objects of a models folder are called: `1: bracket`, ..."""
 _PLY_NAME = re.compile(r"obj_(\d{6})\.ply")
 _ID = re.compile(r"(?:obj(?:ect)?[ _-]?)?0*(\d+)", re.IGNORECASE)
 _REPORTED_BOX_TOLERANCE_MM = 0.5
@@ -143,10 +145,11 @@ def load_models(folder: Path, obj_ids: tuple[int, ...] | None = None) -> dict[in
 
 
 def read_models_info(folder: Path) -> dict[int, dict[str, Any]]:
-    """models_info.json by object id.
+    """models_info.json by object id, with the names that names.yaml beside it gives to objects.
 
     Raises:
-        UserError: it is missing, not JSON, names a key twice, or is not a mapping of ids to entries.
+        UserError: it is missing, not JSON, names a key twice, or is not a mapping of ids to entries; or names.yaml is
+            unusable, or names an object that is not there.
     """
     path = folder / INFO_FILE
     if not path.exists():
@@ -161,7 +164,42 @@ def read_models_info(folder: Path) -> dict[int, dict[str, Any]]:
         if int(key) in entries:
             raise UserError(f"{path}: object {int(key)} is listed twice, once as {shown(key)}")
         entries[int(key)] = entry
+    for obj_id, name in read_names(folder).items():
+        if obj_id not in entries:
+            raise UserError(f"{folder / NAMES_FILE}: object {obj_id} has a name, but no entry in {INFO_FILE}")
+        entries[obj_id] = entries[obj_id] | {"name": name}
     return entries
+
+
+def read_names(folder: Path) -> dict[int, str]:
+    """names.yaml by object id; empty if there is none.
+
+    Raises:
+        UserError: it is no mapping of object ids to names of one line, or two objects have the same one.
+    """
+    path = folder / NAMES_FILE
+    content = read_document(path) if path.exists() else None
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: is {shown(content)}; object ids and names are needed, as `1: bracket`")
+    names: dict[int, str] = {}
+    for key, name in content.items():
+        text = str(key).strip()
+        if not (text.isascii() and text.isdecimal()):
+            raise UserError(f"{path}: the key {shown(key)} is no object id, such as 1")
+        if not (isinstance(name, str) and name.strip() and name.isprintable()):
+            raise UserError(f"{path}: object {text} is called {shown(name)}; a name of one line is needed")
+        if name.strip() in names.values():
+            raise UserError(f"{path}: {shown(name)} is the name of two objects; give each one of its own")
+        names[int(text)] = name.strip()
+    return names
+
+
+def object_names(infos: Mapping[int, Mapping[str, Any]]) -> dict[int, str]:
+    """The names of those objects whose entries in models_info.json have one."""
+    names = {obj_id: info.get("name") for obj_id, info in infos.items()}
+    return {obj_id: name for obj_id, name in names.items() if isinstance(name, str) and name}
 
 
 def _find_meshes(folder: Path) -> dict[int, Path]:

@@ -26,7 +26,7 @@ from synthetless.dataset.layout import (
 )
 from synthetless.dataset.records import CameraFile, Count, ModelEntry, ModelInfo, camera_json, schema_faults
 from synthetless.io.files import read_bytes, read_json
-from synthetless.io.models import INFO_FILE, ObjectModel, load_models, read_models_info
+from synthetless.io.models import INFO_FILE, NAMES_FILE, ObjectModel, load_models, read_models_info
 from synthetless.scenes.spec import Role
 from synthetless.symmetry import SymmetryGroup, SymmetryTable
 from synthetless.validation.records import SceneRecords
@@ -244,7 +244,7 @@ def _read_models(
     """
     path = folder / INFO_FILE
     models: dict[int, ObjectModel] = {}
-    known = {path}
+    known = {path, folder / NAMES_FILE}
     for obj_id, digest in sorted(digests.items()):
         mesh = folder / f"obj_{obj_id:06d}.ply"
         known.add(mesh)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -15,7 +15,15 @@ from synthetless.errors import UserError
 from synthetless.io.documents import read_document, shown
 from synthetless.io.files import atomic_write, write_json
 from synthetless.io.meshes import read_mesh
-from synthetless.io.models import INFO_FILE, find_meshes
+from synthetless.io.models import (
+    INFO_FILE,
+    NAMES_FILE,
+    MeshFiles,
+    find_meshes,
+    object_names,
+    read_models_info,
+    read_names,
+)
 from synthetless.io.parallel import each
 from synthetless.symmetry.atlas import SCHEMES, Scheme
 from synthetless.symmetry.detection.detect import Detected, detect, measure
@@ -98,6 +106,7 @@ class DetectedObject:
         detected: its groups and their residuals.
         quasi: the larger group within the tolerance for those, if one was asked for and there is one.
         quasi_tolerance_mm: that tolerance; None if none was asked for.
+        name: what it is called; None if nothing says so.
     """
 
     obj_id: int
@@ -106,6 +115,7 @@ class DetectedObject:
     detected: Detected
     quasi: GroupFit | None = None
     quasi_tolerance_mm: float | None = None
+    name: str | None = None
 
     @property
     def entry(self) -> SymmetryEntry:
@@ -223,7 +233,7 @@ def detect_folder(
         if not (np.isfinite(value) and value > 0):
             raise UserError(f"{name} is {value}; a number above 0 is needed")
     files = find_meshes(folder)
-    declared, others = _declared(folder), dict(tolerances or {})
+    declared, others, names = _declared(folder), dict(tolerances or {}), _names(files, folder)
     if strangers := sorted(others.keys() - files.paths.keys()):
         known = ", ".join(map(str, files.paths))
         raise UserError(f"object {strangers[0]} has a tolerance, but {folder} holds objects {known}")
@@ -232,8 +242,9 @@ def detect_folder(
         for obj_id, path in files.paths.items()
     ]
     tasks.sort(key=lambda task: -task.path.stat().st_size)  # the longest first, so that no core ends up alone
-    objects = sorted(each(_detect_file, tasks, workers, "symmetries", "mesh"), key=lambda o: o.obj_id)
-    return DetectedFolder(folder, tuple(objects), files.are_numbered, tolerance_percent, scale, others)
+    found = sorted(each(_detect_file, tasks, workers, "symmetries", "mesh"), key=lambda o: o.obj_id)
+    objects = tuple(replace(o, name=names.get(o.obj_id)) for o in found)
+    return DetectedFolder(folder, objects, files.are_numbered, tolerance_percent, scale, others)
 
 
 @dataclass(frozen=True)
@@ -270,8 +281,19 @@ def _declared(folder: Path) -> dict[int, SymmetryGroup]:
     return {obj_id: entry.group for obj_id, entry in table.entries.items()}
 
 
+def _names(files: MeshFiles, folder: Path) -> dict[int, str]:
+    """What names.yaml calls the objects, or models_info.json, or else the files whose names are no ids."""
+    given = read_names(folder)
+    if strangers := sorted(given.keys() - files.paths.keys()):
+        raise UserError(f"{folder / NAMES_FILE}: names object {strangers[0]}, but there is no mesh of it")
+    stems = {obj_id: path.stem for obj_id, path in files.paths.items() if path.stem.isprintable()}
+    known = object_names(read_models_info(folder)) if (folder / INFO_FILE).exists() else {}
+    return (stems if files.are_numbered else {}) | known | given
+
+
 def _models_info(o: DetectedObject) -> dict[str, Any]:
-    return dict(o.info) | o.detected.answer.group.to_bop()
+    name = {} if o.name is None else {"name": o.name}
+    return dict(o.info) | name | o.detected.answer.group.to_bop()
 
 
 def _object_json(o: DetectedObject) -> dict[str, Any]:
