@@ -34,7 +34,7 @@ from synthetless.dataset.layout import (
     find_models_folder,
     scene_folders,
 )
-from synthetless.dataset.reader import Scene, digest, read_recipe, read_specs
+from synthetless.dataset.reader import Image, Scene, digest, read_recipe, read_specs
 from synthetless.dataset.records import AmbiguityEntry, ImageSpec
 from synthetless.dataset.relabel import adopt, relabel
 from synthetless.errors import UserError
@@ -269,6 +269,7 @@ class AmbiguitySource:
             "eps_mm": self.resolution.eps_mm,
             "min_pixels": MIN_PIXELS,
             "poses": self.with_poses,
+            "depth_images": self.size is None and any(map(_has_depth, scenes)),
             "symmetries": self.table.digest(),
             "models": {str(obj_id): digest for obj_id, digest in self.digests.items()},
             "objects": objects,
@@ -372,10 +373,28 @@ def see_images(source: AmbiguitySource, scene: Scene, numbers: Sequence[int]) ->
         K = poses.cameras[number]
         camera = Intrinsics(*size, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2])
         plane, unlabelled = _surroundings(source, scene, number, specs.get(int(poses.image_ids[number])))
+        depth_mm = _depth_image(source, scene.image(number), size)
         yield [
-            _entry(source, camera, body, [*bodies[:i], *bodies[i + 1 :], *unlabelled], plane) if quasi[i] else None
+            _entry(source, camera, body, [*bodies[:i], *bodies[i + 1 :], *unlabelled], plane, depth_mm)
+            if quasi[i]
+            else None
             for i, body in enumerate(bodies)
         ]
+
+
+def _has_depth(paths: ScenePaths) -> bool:
+    return next((paths.root / "depth").glob("*.png"), None) is not None
+
+
+def _depth_image(source: AmbiguitySource, image: Image, size: tuple[int, int]) -> np.ndarray[Any, Any] | None:
+    """What hides in an image of others, if it has depth; of ours everything is recorded."""
+    if source.size is not None or not image.paths.depth(image.im_id).exists():
+        return None
+    depth_mm = image.depth_mm()
+    if depth_mm.shape != size[::-1]:
+        path, (rows, columns) = image.paths.depth(image.im_id), depth_mm.shape
+        raise UserError(f"{path}: is {columns} x {rows} pixels large; the images are {size[0]} x {size[1]}")
+    return depth_mm
 
 
 def _surroundings(
@@ -402,13 +421,15 @@ def _entry(
     body: PosedModel,
     others: list[PosedModel | PosedSurface],
     plane: Plane | None,
+    depth_mm: np.ndarray[Any, Any] | None,
 ) -> AmbiguityEntry:
     table, entry = source.table, source.table.entries[body.obj_id]
     canonical_map = table.quasi_map(body.obj_id)
     canonical = canonical_map(body.R_m2c[None], body.t_m2c[None])
     cosets = source.cosets(body.obj_id)
     R_canonical = canonical.R_m2c[0]
-    seen = see(_caster(source.meshes), camera, body, R_canonical, cosets, others, plane, source.resolution)
+    caster, resolution = _caster(source.meshes), source.resolution
+    seen = see(caster, camera, body, R_canonical, cosets, others, plane, resolution, depth_mm)
     result: AmbiguityEntry = {
         "obj_id": body.obj_id,
         "cam_R_m2c_quasi": R_canonical.reshape(9).tolist(),

@@ -35,6 +35,8 @@ SAMPLES = 24
 """Turns that stand for the turns of SO(2) and O(2), or the next number that the exact group's order divides."""
 FINEST_MM = 0.3
 """No sensor is taken to resolve less, however near the object is."""
+SENSOR_MM = 15.0
+"""What a depth image shows nearer than an object by more is another body: BOP's tolerance of visibility."""
 THETA_DEG = 10.0
 """Normals that differ by more can be told apart by their shading."""
 
@@ -373,6 +375,7 @@ def see(
     others: Sequence[PosedModel | PosedSurface] = (),
     plane: Plane | None = None,
     resolution: Resolution = Resolution(),
+    depth_image_mm: Floats | None = None,
 ) -> Ambiguity:
     """What an image tells of one of its objects.
 
@@ -385,6 +388,8 @@ def see(
         others: every other body in the image.
         plane: the table, or None.
         resolution: what is compared.
+        depth_image_mm: (H, W) what a sensor measured, 0 where it measured nothing, to find bodies that nobody recorded;
+            None if they are all known.
     """
     true, R, t = cosets.candidates(posed.R_m2c, posed.t_m2c, R_canonical)
     surface = caster.pose(posed)
@@ -396,7 +401,13 @@ def see(
     if 0 not in window.shape:
         rays = Rays.through(camera, window)
         occluder_mm = nearest_depth_mm([caster.pose(other) for other in others], plane, camera, rays)
-        image = _Image.of(surface, min(body.nearest_mm for body in bodies), rays, occluder_mm, resolution.what, eps_mm)
+        view = View.of(surface, rays, resolution.what)
+        if depth_image_mm is not None:
+            measured_mm = depth_image_mm[window.slices_in(image_window(camera))]
+            is_nearer = (measured_mm > 0) & (measured_mm < view.depth_mm - SENSOR_MM)
+            occluder_mm = np.where(is_nearer, np.minimum(occluder_mm, measured_mm), occluder_mm)
+        nearest_mm = min(body.nearest_mm for body in bodies)
+        image = _Image.of(view, nearest_mm, rays, occluder_mm, resolution.what, eps_mm)
         for number, body in enumerate(bodies):
             if number != true:
                 apart[number] = image.count_apart(body)
@@ -428,11 +439,8 @@ class _Image:
     eps_mm: float
 
     @classmethod
-    def of(
-        cls, body: PosedSurface, nearest_mm: float, rays: Rays, occluder_mm: Floats, what: What, eps_mm: float
-    ) -> _Image:
-        """Cast the object at its true pose; no pose of it reaches closer to the camera than ``nearest_mm``."""
-        view = View.of(body, rays, what)
+    def of(cls, view: View, nearest_mm: float, rays: Rays, occluder_mm: Floats, what: What, eps_mm: float) -> _Image:
+        """Of the view of its true pose; no pose of it reaches closer to the camera than ``nearest_mm``."""
         may_count = occluder_mm > np.minimum(view.depth_mm, nearest_mm)
         castable = np.asarray(cv2.dilate(may_count.astype(np.uint8), _NEIGHBOURS), np.bool_)
         rows, columns = (np.arange(length) for length in rays.window.shape)

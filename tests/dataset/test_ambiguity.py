@@ -28,6 +28,7 @@ from synthetless.dataset.relabel import adopt, relabel
 from synthetless.errors import UserError
 from synthetless.exports.coco import export_coco
 from synthetless.exports.webdataset import export_webdataset, relabel_webdataset
+from synthetless.io.images import encode_depth
 from synthetless.learning.targets import LabelMaker, coset_targets
 from synthetless.preview.statistics import statistics
 from synthetless.symmetry.ambiguity import Cosets
@@ -239,7 +240,7 @@ def test_a_kill_before_any_change_on_disk_loses_nothing(judged: Path, tmp_path: 
 
 
 def test_datasets_of_others(root: Path, tmp_path: Path) -> None:
-    """Without records, recipe and table: the same, but for what the table hides."""
+    """Without records, recipe and table: the same, since depth images show what hides."""
     own = {name: path.read_text() for name, path in files(root).items()}
     for name in ("dataset.json", "symmetries.json", "ambiguity.json"):
         (root / name).unlink()
@@ -257,7 +258,8 @@ def test_datasets_of_others(root: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="not found; a BOP models folder"):
         write_ambiguity(root, models=tmp_path, workers=1)
     write_ambiguity(root, with_poses=True, workers=1)
-    fields = ("obj_id", "cam_R_m2c_quasi", "coset_true", "eps_mm")
+    assert json.loads((root / "ambiguity.json").read_text())["depth_images"]
+    fields = ("obj_id", "cam_R_m2c_quasi", "coset_true", "cosets_alike", "eps_mm")
     for name, text in own.items():
         before, after = json.loads(text), json.loads(files(root)[name].read_text())
         for im_id, image in before.items():
@@ -266,6 +268,10 @@ def test_datasets_of_others(root: Path, tmp_path: Path) -> None:
                 assert one is None or [one[field] for field in fields] == [other[field] for field in fields]
     assert validate(root, workers=1).valid
     adopt(root, symmetries=tmp_path / "table.yaml", workers=1)
+    depth = root / "train_synthetless" / SCENES[0] / "depth" / "000000.png"
+    depth.write_bytes(encode_depth(np.full((9, 16), 500.0), 0.1))
+    with pytest.raises(UserError, match="is 16 x 9 pixels large; the images are 128 x 96"):
+        write_ambiguity(root, eps_mm=2.0, workers=1)
 
 
 def test_objects_without_a_quasi_symmetry_cost_nothing(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:

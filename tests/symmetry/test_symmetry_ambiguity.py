@@ -218,6 +218,20 @@ def test_what_hides_the_notch_makes_the_image_ambiguous(caster: RayCaster) -> No
     assert judged(caster, 1, R, group("C1"), group("C2"), (behind,)).view_ambiguity == 0.5
 
 
+def test_a_depth_image_shows_what_hides_and_the_object_itself_does_not(caster: RayCaster) -> None:
+    posed = PosedModel(1, azimuthal_pose(0), np.array([2.0, -1.0, 350.0]))
+    cover = PosedModel(3, np.eye(3), np.array([2.0, -1.0, 280.0]))
+    rays, quasi = Rays.through(CAMERA, image_window(CAMERA)), group("C2")
+    R_canonical = CanonicalMap(quasi)(posed.R_m2c[None], posed.t_m2c[None]).R_m2c[0]
+    noise = np.random.default_rng(1).normal(scale=3.0, size=(CAMERA.height, CAMERA.width))
+    for bodies, expected in (([posed], 0.5), ([posed, cover], 1.0), ([], 0.5)):
+        depth_mm = nearest_depth_mm([caster.pose(body) for body in bodies], None, CAMERA, rays)
+        image_mm = np.where(np.isfinite(depth_mm), depth_mm + noise, 0.0)
+        cosets = Cosets.of(quasi, group("C1"))
+        seen = see(caster, CAMERA, posed, R_canonical, cosets, resolution=COARSE, depth_image_mm=image_mm)
+        assert seen.view_ambiguity == expected
+
+
 @pytest.mark.parametrize(
     ("obj_id", "axis", "name"), [(2, (0, 0, 1), "C12"), (2, (1, 0, 0), "D6"), (1, (1, 0, 0), "O(2)")]
 )
