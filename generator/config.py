@@ -192,6 +192,18 @@ def copy_recipe(name: str, to: Path | None = None) -> Path:
     return place
 
 
+def override(key: str, value: object) -> str:
+    """The override that gives a setting this value.
+
+    Raises:
+        RecipeError: it is no value that a recipe can hold.
+    """
+    try:
+        return f"{key}={json.dumps(value)}"
+    except (TypeError, ValueError):
+        raise RecipeError(f"{key} = {shown(value)}: expected text, a number, a list, or a mapping of them") from None
+
+
 def load_recipe(path: Path | None, overrides: Sequence[str] = ()) -> Recipe:
     """Read a recipe, by its file or its name, and apply ``key.path=value`` overrides (values are YAML).
 

@@ -23,11 +23,11 @@ from typing import Literal
 
 import psutil
 
+from synthetless import extras
 from synthetless.generation.devices import Answer, ask, probe
 from synthetless.io.files import nearest_existing
 from synthetless.io.parallel import usable_cores
 
-PYTHON = (3, 11)
 BLENDER = "4.5"
 PACKAGES = {
     "libX11.so.6": "libx11-6",
@@ -138,8 +138,8 @@ def _wrapped(text: str, head: str, indent: int, width: int) -> list[str]:
 
 def check_python(version: tuple[int, ...]) -> Check:
     found = ".".join(map(str, version))
-    wanted = ".".join(map(str, PYTHON))
-    if version[:2] == PYTHON:
+    wanted = ".".join(map(str, extras.BLENDER_PYTHON))
+    if version[:2] == extras.BLENDER_PYTHON:
         return Check("Python", "ok", found)
     return Check(
         "Python", "fail", found, f"Blender as a module is built for {wanted} only: python{wanted} -m venv .venv"
@@ -149,7 +149,7 @@ def check_python(version: tuple[int, ...]) -> Check:
 def check_blender(version: str | None) -> Check:
     install = f"pip install 'bpy=={BLENDER}.*'"
     if version is None:
-        return Check("Blender", "fail", "the bpy module is not installed", install)
+        return Check("Blender", "fail", "the bpy module is not installed", extras.remedy("blender"))
     if not version.startswith(f"{BLENDER}."):
         return Check("Blender", "warn", f"bpy {version}; datasets are tested with {BLENDER}", install)
     return Check("Blender", "ok", f"bpy {version}")

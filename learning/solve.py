@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synthetless.extras import cv2
 from synthetless.learning.pose_error import RigidPose
 
 Floats = NDArray[np.float64]

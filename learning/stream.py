@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Literal
 
 import numpy as np
 from embreex.rtcore import EmbreeDevice
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from typing_extensions import Self
 
 from synthetless.annotation.instances import Window
 from synthetless.annotation.raycast import MISS, PosedSurface, Rays, Surface

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from synthetless.extras import MissingExtraError
+
 Kind = Literal["cpu", "optix", "cuda", "hip", "oneapi", "metal"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 """What Cycles can compute on. Of the GPUs, the faster way to use the same one comes first."""
@@ -53,7 +55,7 @@ def start(threads: int = 0, device: RenderDevice = CPU) -> Any:
         with console_to(Path(os.devnull)), _one_core() if threads == 1 else contextlib.nullcontext():
             bpy = module()  # it complains of audio devices that a server does not have
     except ModuleNotFoundError:
-        raise BlenderError("Blender is not installed; run: pip install 'synthetless[blender]'") from None
+        raise BlenderError(str(MissingExtraError("bpy"))) from None
     except ImportError as error:
         raise BlenderError(f"Blender cannot start ({error}); run `make system-libraries`") from None
     bpy.ops.wm.read_factory_settings(use_empty=True)

@@ -16,10 +16,10 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synthetless.extras import cv2
 from synthetless.scenes.sampling import draw_sensor
 from synthetless.scenes.settings import SensorSettings
 from synthetless.scenes.spec import SensorSpec

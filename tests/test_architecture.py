@@ -18,6 +18,7 @@ FOLDERS = {
 
 FLOORS = (
     {"errors", "assets"},
+    {"extras"},
     {"scenes"},
     {"io"},
     {"config"},
@@ -27,7 +28,7 @@ FLOORS = (
     {"generation", "exports"},
     {"validation", "preview", "fetch", "doctor"},
     {"learning"},
-    {"cli"},
+    {"cli", "api"},
     {"__main__"},
 )
 """The rooms of the package, from the bottom: each imports from the floors below it, and from itself."""
@@ -64,6 +65,7 @@ def test_every_room_has_a_floor() -> None:
 
 def test_imports_go_one_way() -> None:
     floor = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
+    floor["package"] = len(FLOORS)  # the package's own names, which it loads when they are asked for
     wrong = []
     for module, path in MODULES.items():
         here = _room(module)
@@ -91,6 +93,27 @@ def test_what_needs_no_blender_runs_where_it_is_not_installed() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_base_install_does_without_the_extras() -> None:
+    """What only some commands need is imported when it is used, and asked for in one line that says how to get it."""
+    rooms = WITHOUT_BLENDER - {"preview"} | {"api", "cli", "doctor", "errors", "extras", "fetch", "package"}
+    names = [module for module in MODULES if _room(module) in rooms]
+    code = (
+        "import sys, importlib\n"
+        "from synthetless.extras import EXTRAS, MissingExtraError, cv2, need\n"
+        "for name in EXTRAS: sys.modules[name] = None\n"
+        f"for name in {names!r}: importlib.import_module(name)\n"
+        "for name in EXTRAS:\n"
+        "    try: need(name)\n"
+        "    except MissingExtraError as error: assert f'[{EXTRAS[name]}]' in str(error), error\n"
+        "    else: raise AssertionError(name)\n"
+        "try: cv2.imdecode\n"
+        "except MissingExtraError as error: print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("OpenCV is not installed; run: pip install ")
 
 
 def test_a_score_needs_no_torch() -> None:

@@ -10,11 +10,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore import EmbreeDevice
-from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
@@ -31,7 +29,15 @@ from synthetless.annotation.instances import (
     visible_within,
 )
 from synthetless.errors import UserError
+from synthetless.extras import LazyModule
 from synthetless.scenes.spec import Intrinsics
+
+if TYPE_CHECKING:
+    from embreex import mesh_construction, rtcore, rtcore_scene
+else:
+    mesh_construction, rtcore, rtcore_scene = (
+        LazyModule(f"embreex.{name}") for name in ("mesh_construction", "rtcore", "rtcore_scene")
+    )
 
 NEAR_CLIP_MM = 10.0
 """Nothing closer to the camera plane than this is seen; the rendering camera clips at the same distance."""
@@ -93,7 +99,7 @@ class Surface:
         scene: Embree's tree over ``faces``.
     """
 
-    def __init__(self, device: EmbreeDevice, vertices_mm: ArrayLike, faces: ArrayLike) -> None:
+    def __init__(self, device: rtcore.EmbreeDevice, vertices_mm: ArrayLike, faces: ArrayLike) -> None:
         """Build the tree.
 
         Args:
@@ -119,8 +125,8 @@ class Surface:
         self.normals: NDArray[np.float64] = normals[solid] / doubled_areas[solid, None]
         self.offsets_mm: NDArray[np.float64] = _dot(self.normals, self.vertices_mm[self.faces[:, 0]])
         self.hull_mm = _hull_points(np.unique(used, axis=0) - self.center_mm)
-        self.scene = EmbreeScene(device, robust=True)  # robust: no ray slips through between two triangles
-        TriangleMesh(self.scene, self.vertices_mm.astype(np.float32), self.faces)
+        self.scene = rtcore_scene.EmbreeScene(device, robust=True)  # robust: no ray slips through between two triangles
+        mesh_construction.TriangleMesh(self.scene, self.vertices_mm.astype(np.float32), self.faces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,7 +338,7 @@ class RayCaster:
             meshes: vertices (V, 3) in millimetres, model frame, and faces (F, 3), by role and object id.
         """
         self._meshes = meshes
-        self._device = EmbreeDevice()
+        self._device = rtcore.EmbreeDevice()
         self._surfaces: dict[MeshKey, Surface] = {}
 
     def annotate(

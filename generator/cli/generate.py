@@ -14,6 +14,7 @@ from synthetless.cli.options import AsJson, RecipeArgument, Workers
 from synthetless.cli.progress import display
 from synthetless.cli.terminal import EXIT_FAILED, EXIT_INTERRUPTED, leave, say
 from synthetless.errors import UserError
+from synthetless.extras import need
 from synthetless.scenes.blender import KINDS, Kind
 
 if TYPE_CHECKING:
@@ -98,6 +99,7 @@ def generate_command(
         raise UserError(f"--address {address} is of a Ray cluster; add --executor ray")
     if dry_run and executor == "ray":
         raise UserError("--dry-run measures this machine; leave out --executor ray")
+    need("bpy")
     with display(json_progress) as tell:  # from here on it takes time
         from synthetless.dataset.layout import Part
         from synthetless.generation import devices
@@ -185,6 +187,7 @@ def render_command(
     as_json: AsJson = False,
 ) -> None:
     """Render one recorded image again."""
+    need("bpy")
     from synthetless.dataset.layout import refuse_target
     from synthetless.generation.rerender import render_again
     from synthetless.io.files import atomic_write
@@ -209,6 +212,7 @@ def redo_command(
 
     It is made alone, in the foreground, and put where it is missing.
     """
+    need("bpy")
     from synthetless.generation.drop import DropFailed
     from synthetless.generation.generate import retry
 

@@ -10,6 +10,7 @@ import typer
 
 from synthetless.cli.options import AsJson, Split, Workers
 from synthetless.cli.terminal import EXIT_FAILED, say
+from synthetless.extras import need
 
 
 def recipes_command(
@@ -68,6 +69,8 @@ def preview_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print the statistics as JSON.")] = False,
 ) -> None:
     """Make a gallery and statistics for the browser."""
+    need("jinja2")
+    need("matplotlib")
     from synthetless.dataset.labels import undisturbed
     from synthetless.io.files import read_json
     from synthetless.preview import write_preview

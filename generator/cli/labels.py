@@ -55,8 +55,7 @@ def adopt_command(
     from synthetless.dataset.relabel import adopt
 
     done = adopt(dataset, models, symmetries, scheme)
-    answer = asdict(done) | {"models": str(done.models), "table": done.table.to_dict()}
-    say(json.dumps(answer) if as_json else done)
+    say(json.dumps(done.to_json()) if as_json else done)
 
 
 def ambiguity_command(

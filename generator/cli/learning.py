@@ -11,6 +11,7 @@ import typer
 
 from synthetless.cli.options import AsJson, RecipeArgument, Split, Workers, above_zero
 from synthetless.cli.terminal import say
+from synthetless.extras import need
 
 
 def score_command(
@@ -92,7 +93,7 @@ def compare_command(
 
     Trains the same small network on ray-cast crops under several label sets.
     """
-    need_torch()
+    need("torch")
     from synthetless.config import models_folder
     from synthetless.learning.compare import COLUMNS, Comparison, compare, table_rows
     from synthetless.learning.stream import CropSettings
@@ -129,20 +130,6 @@ def compare_command(
     say(f"page: {out / 'index.html'}")
 
 
-def need_torch() -> None:
-    """Refuse in one line where the extra is not installed; torch itself is imported when it is needed.
-
-    Raises:
-        UserError: torch cannot be found.
-    """
-    from importlib.util import find_spec
-
-    from synthetless.errors import UserError
-
-    if find_spec("torch") is None:
-        raise UserError("this command needs torch: pip install 'synthetless[learn]'")
-
-
 def _words(text: str) -> list[str]:
     return [word.strip() for word in text.split(",") if word.strip()]
 
@@ -177,7 +164,7 @@ def train_command(
 
     Several GPUs: torchrun --nproc-per-node N -m synthetless train CONFIG ...
     """
-    need_torch()
+    need("torch")
     from synthetless.config import load_settings
     from synthetless.learning.settings import Training
 
@@ -219,7 +206,7 @@ def predict_command(
 
     The classifier chooses the regressor, its corners are solved for the pose. Judge the file with score.
     """
-    need_torch()
+    need("torch")
     from synthetless.learning.predict import predict
 
     found = predict(run, dataset, to, overlays, split, device, camera)
@@ -236,8 +223,11 @@ def curves_command(
     to: Annotated[Path, typer.Option(metavar="FILE", help="HTML page to write.")],
     as_json: AsJson = False,
 ) -> None:
-    """Draw the learning curves of several trainings in one figure for each loss."""
-    need_torch()
+    """Draw the learning curves of several trainings.
+
+    In one figure for each loss.
+    """
+    need("torch")
     from synthetless.learning.train import write_curves
 
     write_curves(runs, to)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -29,7 +28,7 @@ def display(as_json: bool) -> Iterator[Callable[[Progress], None]]:
         with _bar() as tell:
             yield tell
     else:
-        yield _Lines(_as_text, _LINE_EVERY_S)
+        yield _Lines(str, _LINE_EVERY_S)
 
 
 class _Lines:
@@ -57,27 +56,10 @@ def _bar() -> Iterator[Callable[[Progress], None]]:
 
         def tell(progress: Progress) -> None:
             bar.n = progress.share
-            bar.set_description_str(printable(_as_text(progress)))
+            bar.set_description_str(printable(str(progress)))
 
         yield tell
 
 
 def _as_json(progress: Progress) -> str:
     return json.dumps(asdict(progress))
-
-
-def _as_text(progress: Progress) -> str:
-    """Images, rate and time left as soon as they are known; then what is done now."""
-    known = [f"{progress.images} of {progress.wanted} images"] if progress.wanted else []
-    if progress.images_per_hour is not None and progress.left_s is not None:
-        known += [f"{progress.images_per_hour:.0f} an hour", f"{clock(progress.left_s)} left"]
-    if progress.failed_drops:
-        known.append(f"{progress.failed_drops} failed drop{'s' if progress.failed_drops > 1 else ''}")
-    return ": ".join(filter(None, (", ".join(known), progress.doing)))
-
-
-def clock(seconds: float) -> str:
-    """A time as h:mm:ss, or m:ss if it is short; rounded up, so that what is left is never nothing."""
-    minutes, rest = divmod(math.ceil(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

@@ -41,6 +41,7 @@ def end(error: BaseException) -> NoReturn:
     its traceback, where to report it, and 3.
     """
     from synthetless.errors import UserError
+    from synthetless.extras import EXTRAS, MissingExtraError
     from synthetless.scenes.blender import BlenderError
 
     match error:
@@ -48,6 +49,8 @@ def end(error: BaseException) -> NoReturn:
             leave("interrupted", EXIT_INTERRUPTED)
         case UserError() | BlenderError():
             leave(str(error), EXIT_WRONG_REQUEST)
+        case ModuleNotFoundError() if (package := (error.name or "").partition(".")[0]) in EXTRAS:
+            leave(str(MissingExtraError(package)), EXIT_WRONG_REQUEST)
         case BrokenPipeError() if not _is_read():
             sys.exit(EXIT_FAILED)
         case OSError():

@@ -17,7 +17,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from synthetless.annotation.instances import PosedModel
@@ -38,6 +37,7 @@ from synthetless.dataset.reader import Image, Scene, digest, read_recipe, read_s
 from synthetless.dataset.records import AmbiguityEntry, ImageSpec
 from synthetless.dataset.relabel import adopt, relabel
 from synthetless.errors import UserError
+from synthetless.extras import cv2
 from synthetless.io.files import locked, read_bytes, read_json, remove_file, replace_file, write_json
 from synthetless.io.models import ObjectModel, load_models, read_models_info
 from synthetless.io.parallel import each

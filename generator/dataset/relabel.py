@@ -18,6 +18,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,6 +159,11 @@ class Adoption:
     instances: int
     written: int
 
+    def to_json(self) -> dict[str, Any]:
+        """JSON values."""
+        counts = {"scenes": self.scenes, "images": self.images, "instances": self.instances, "written": self.written}
+        return {"models": str(self.models), "table": self.table.to_dict(), "splits": list(self.splits), **counts}
+
     def __str__(self) -> str:
         return (
             f"{self.instances} instances in {self.images} images of {', '.join(self.splits)}, scheme "
@@ -184,8 +190,7 @@ def relabel(
             None for those of symmetries.json, which may have been edited.
         scheme: None for what the table states, and else for the one there is.
         dry_run: write nothing, only tell what would change.
-        workers: processes; one per available core if None. They are spawned: a script that calls this needs
-            ``if __name__ == "__main__"``.
+        workers: processes; one per available core if None.
 
     Raises:
         UserError: the symmetries are invalid, or of other objects; the dataset is damaged or cannot be written.

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from synthetless.dataset.layout import ScenePaths, scene_ids
 from synthetless.dataset.reader import Image, Scene
 from synthetless.errors import UserError
+from synthetless.extras import cv2
 from synthetless.io import images
 from synthetless.io.files import atomic_write
 from synthetless.io.models import BOX_EDGES

@@ -11,11 +11,11 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, NotRequired
+from typing import Any, Literal
 
 from pycocotools import mask as coco_mask
 from tqdm import tqdm
-from typing_extensions import TypedDict
+from typing_extensions import NotRequired, TypedDict
 
 from synthetless.dataset.labels import refuse_half_labelled
 from synthetless.dataset.layout import ScenePaths, find_split, refuse_target, scene_ids

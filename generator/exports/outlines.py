@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+
+from synthetless.extras import cv2
 
 Ring = NDArray[np.int64]
 """(N, 2) corners (column, row) of a closed polygon; the last is joined with the first."""

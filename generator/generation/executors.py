@@ -32,7 +32,7 @@ from synthetless.generation.devices import CPU, Devices
 from synthetless.generation.drop import DropFailed, DropRenderer
 from synthetless.generation.progress import COLLIDERS, STARTING, Report, Stage, Work, unreported
 from synthetless.generation.sources import Sources, load_sources
-from synthetless.io.parallel import without_interrupts
+from synthetless.io.parallel import without_interrupts, without_script
 from synthetless.scenes.blender import BlenderError, RenderDevice, console_to
 
 FAULT_VARIABLE = "SYNTHETLESS_FAULTS"
@@ -260,7 +260,7 @@ class _LocalPool:
         process = context.Process(target=_serve, args=(theirs, self._config, log), daemon=True)
         worker = _Worker(process, ours, log, time.monotonic())
         try:
-            with without_interrupts(), console_to(log):
+            with without_interrupts(), without_script(), console_to(log):
                 process.start()
                 self._workers.append(worker)
         except OSError as error:  # no memory, or no process, is left for it

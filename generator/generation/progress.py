@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
@@ -41,6 +42,22 @@ class Progress:
     elapsed_s: float = 0.0
     images_per_hour: float | None = None
     left_s: float | None = None
+
+    def __str__(self) -> str:
+        """Images, rate and time left as soon as they are known; then what is done now."""
+        known = [f"{self.images} of {self.wanted} images"] if self.wanted else []
+        if self.images_per_hour is not None and self.left_s is not None:
+            known += [f"{self.images_per_hour:.0f} an hour", f"{_clock(self.left_s)} left"]
+        if self.failed_drops:
+            known.append(f"{self.failed_drops} failed drop{'s' if self.failed_drops > 1 else ''}")
+        return ": ".join(filter(None, (", ".join(known), self.doing)))
+
+
+def _clock(seconds: float) -> str:
+    """A time as h:mm:ss, or m:ss if it is short; rounded up, so that what is left is never nothing."""
+    minutes, rest = divmod(math.ceil(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 Tell = Callable[[Progress], None]

@@ -24,6 +24,7 @@ from uuid import uuid4
 from synthetless.dataset.layout import LOGS_FOLDER
 from synthetless.dataset.store import DatasetStore, FinishedImage, versions
 from synthetless.errors import UserError
+from synthetless.extras import MissingExtraError
 from synthetless.generation.devices import CPU, ask, take_assigned
 from synthetless.generation.executors import (
     FAULT_VARIABLE,
@@ -399,7 +400,7 @@ def connected(address: str) -> Iterator[Any]:
     try:
         import ray
     except ModuleNotFoundError:
-        raise UserError("executor ray: Ray is not installed; run: pip install 'synthetless[ray]'") from None
+        raise MissingExtraError("ray") from None
     # Where nobody answers, Ray tries for two minutes and then ends the process: so another process tries first.
     trial = ask((sys.executable, "-c", _TRIAL, address), _CONNECT_LIMIT_S)
     problem = trial.problem if trial.found is None else trial.found["error"]

@@ -63,8 +63,7 @@ def redevelop(root: Path, to: Path, overrides: Sequence[str], workers: int | Non
         root: the dataset, made with ``exr`` among its outputs.
         to: the new dataset's folder.
         overrides: ``sensor=NAME`` or ``sensor.KEY=VALUE``; they say all of the sensor, whatever that of ``root`` is.
-        workers: processes; one per available core if None. They are spawned: a script that calls this needs
-            ``if __name__ == "__main__"``.
+        workers: processes; one per available core if None.
 
     Returns:
         How many images there are. The same call gives the same bytes.

@@ -18,11 +18,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from synthetless.errors import UserError
+from synthetless.extras import MissingExtraError, cv2
 from synthetless.scenes import render
 
 COORDINATE_SCALE_MM = 0.02
@@ -37,9 +37,10 @@ _COORDINATE_LIMIT_MM = COORDINATE_SCALE_MM * _NORMAL_SCALE
 # read by every epoch, export and check: deflate and the search for the best filter, which OpenCV leaves out where no
 # level is given, cost 2 ms more to write and a third of the time to read. Depth and coordinates are smooth, where
 # deflate's search for repetitions pays.
-_RUNS = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
-_QUICK_TO_READ = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT)
-_DEFLATE = (cv2.IMWRITE_PNG_COMPRESSION, 3)
+_COMPRESSION, _STRATEGY, _DEFAULT, _RLE = 16, 17, 0, 3  # OpenCV's IMWRITE_PNG_...
+_RUNS = (_COMPRESSION, 1, _STRATEGY, _RLE)
+_QUICK_TO_READ = (_COMPRESSION, 1, _STRATEGY, _DEFAULT)
+_DEFLATE = (_COMPRESSION, 3)
 
 
 class DamagedImageError(UserError):
@@ -231,7 +232,7 @@ def read_exr(path: Path) -> NDArray[np.float32]:
     try:
         linear = render.read_exr(path)
     except ModuleNotFoundError:
-        raise UserError(f"{path}: to read it, the OpenEXR package is needed; install synthetless[blender]") from None
+        raise MissingExtraError("OpenEXR") from None
     except (RuntimeError, KeyError, ValueError) as error:
         raise UserError(f"{path}: cannot be decoded ({' '.join(str(error).split())})") from None
     if linear.ndim != 3 or linear.shape[2] != 3 or not np.isfinite(linear).all():

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import active_children, connection, get_context, parent_process, resource_tracker
+from types import ModuleType
 from typing import Protocol, TypeVar
 
 from tqdm import tqdm
@@ -35,7 +37,8 @@ def usable_cores() -> int:
 def processes(wanted: int | None, most: int) -> Iterator[Map]:
     """Start processes for the duration, and give the ``map`` that shares work out among them.
 
-    They are spawned, so a script that gets here needs ``if __name__ == "__main__"``. None outlives this process.
+    They are spawned, and do not import the script that gets here; functions and tasks come from modules. None outlives
+    this process.
 
     Args:
         wanted: how many; one per core if None.
@@ -52,7 +55,7 @@ def processes(wanted: int | None, most: int) -> Iterator[Map]:
     pool = ProcessPoolExecutor(count, get_context("spawn"), _prepare)
 
     def map_in_pool(function: Callable[[Task], Result], tasks: Sequence[Task], chunksize: int = 1) -> Iterator[Result]:
-        with without_interrupts():  # the processes are started here
+        with without_interrupts(), without_script():  # the processes are started here
             return pool.map(function, tasks, chunksize=chunksize)
 
     try:
@@ -92,6 +95,20 @@ def without_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+@contextmanager
+def without_script() -> Iterator[None]:
+    """Processes that are spawned meanwhile do not import ``__main__``.
+
+    A script without ``if __name__ == "__main__"`` would do in each of them what it does, and the fault would be theirs.
+    """
+    script = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
 
 
 def _prepare() -> None:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +19,7 @@ from synthetless.dataset.layout import CAMERA_FILE
 from synthetless.dataset.reader import Image, Instance, Visibility
 from synthetless.dataset.records import ImageSpec, ModelInfo
 from synthetless.errors import UserError
+from synthetless.extras import cv2
 from synthetless.io import images
 from synthetless.io.files import atomic_write, read_bytes
 from synthetless.io.models import BOX_EDGES

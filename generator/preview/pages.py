@@ -13,6 +13,7 @@ from typing import Any
 
 from synthetless.dataset.sheet import class_color
 from synthetless.errors import UserError
+from synthetless.extras import MissingExtraError
 from synthetless.io.files import atomic_write, read_bytes
 from synthetless.preview.plots import plots
 from synthetless.preview.statistics import Statistics
@@ -94,7 +95,7 @@ def render(template: str, **values: Any) -> str:
     try:
         from jinja2 import Environment, PackageLoader, StrictUndefined
     except ImportError:
-        raise UserError("a preview needs jinja2 and matplotlib: pip install 'synthetless[preview]'") from None
+        raise MissingExtraError("jinja2") from None
     environment = Environment(
         loader=PackageLoader("synthetless.preview"),
         autoescape=True,

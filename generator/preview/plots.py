@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetless.errors import UserError
+from synthetless.extras import MissingExtraError
 from synthetless.preview.distributions import Distribution
 from synthetless.preview.statistics import (
     CELLS,
@@ -70,7 +70,7 @@ def plots(of: Statistics) -> Iterator[tuple[str, bytes]]:
     try:
         from matplotlib import rc_context
     except ImportError:
-        raise UserError("plots need matplotlib: pip install 'synthetless[preview]'") from None
+        raise MissingExtraError("matplotlib") from None
     with rc_context(_STYLE):
         for each in of.distributions:
             yield each.key, distribution_plot(each)

@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, get_args
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from synthetless.annotation.instances import PosedModel, Window, image_window
 from synthetless.annotation.raycast import MISS, Plane, PosedSurface, RayCaster, Rays
 from synthetless.errors import UserError
+from synthetless.extras import cv2
 from synthetless.scenes.spec import Intrinsics
 from synthetless.symmetry.groups import SymmetryGroup
 from synthetless.symmetry.quaternions import Floats, conjugate, from_matrix, multiply, normalise, rotate, to_matrix

@@ -12,10 +12,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Self
 
 from synthetless.errors import UserError
 from synthetless.symmetry.from_bop import recognise

@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,6 +32,7 @@ from synthetless.dataset.records import (
     ModelInfo,
     read_scene_json,
 )
+from synthetless.extras import cv2
 from synthetless.io.files import read_bytes
 from synthetless.io.images import DamagedImageError, decode_depth, decode_mask, decode_rgb
 from synthetless.io.models import INFO_FILE
@@ -43,9 +43,11 @@ from synthetless.validation.images import (
     InstanceMasks,
     Mask,
     Pictures,
+    can_see,
     check_info,
     check_masks,
     container_fault,
+    not_seen,
 )
 from synthetless.validation.recompute import check_labels
 from synthetless.validation.records import Place, SceneRecords, check_instances, check_poses, read_entries, read_judged
@@ -144,7 +146,7 @@ def check_foreign_scene(task: ForeignTask) -> ForeignResult:
     tally.add(check_ambiguity(foreign.root, scene))
     files = SceneFiles.list(scene)
     tally.add(files.check_folders(scene))
-    for im_id in sorted(scene.gt.keys() | files.image_ids):
+    for im_id in sorted(scene.gt.keys() | files.image_ids) if can_see() else ():
         tally.add(_check_image(scene, files, im_id))
     instances = sum(len(gt) for gt in scene.gt.values())
     return ForeignResult(tally, len(scene.gt), instances, files.unchecked)
@@ -163,6 +165,8 @@ def notes_on(foreign: Foreign, results: Sequence[ForeignResult]) -> Iterator[str
     )
     if sensors := {name for scene in foreign.scenes for name in other_sensors(scene.root)}:
         yield f"several sensors in one scene folder ({', '.join(sorted(sensors))}) are not supported, and not checked"
+    if not can_see():
+        yield not_seen()
     if foreign.infos is None:
         yield f"labels were not recomputed: no {INFO_FILE} inside the dataset"
     for what in (("scene_gt_info.json",), ("mask",), ("mask_visib",), ("depth",), ("rgb", "gray")):

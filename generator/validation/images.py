@@ -5,7 +5,6 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pycocotools import mask as coco_mask
 
+from synthetless import extras
 from synthetless.annotation.instances import NO_BOX, Box, Window, bounding_box
 from synthetless.dataset.layout import ScenePaths
 from synthetless.dataset.records import MIN_VISIB_FRACT, CocoAnnotation, GtInfoEntry, amodal_box, uncompressed_rle
@@ -27,6 +27,9 @@ Decoder = Callable[[bytes, Path], NDArray[Any]]
 
 _PNG, _JPEG, _EXR, _TIFF = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"\x76\x2f\x31\x01", (b"II*\0", b"MM\0*")
 _JPEG_SCAN, _JPEG_END = b"\xff\xda", b"\xff\xd9"
+
+
+_EYES = ("cv2", "embreex")
 
 
 # Reading
@@ -76,7 +79,27 @@ class Pictures:
 
 def can_decode_exr() -> bool:
     """Whether the OpenEXR package is installed."""
-    return find_spec("OpenEXR") is not None
+    return extras.has("OpenEXR")
+
+
+def can_see() -> bool:
+    """Whether what decodes images and casts rays is installed."""
+    return all(extras.has(module) for module in _EYES)
+
+
+def see() -> None:
+    """Refuse in one line where ``can_see`` does not hold.
+
+    Raises:
+        UserError: something is not installed.
+    """
+    for module in _EYES:
+        extras.need(module)
+
+
+def not_seen() -> str:
+    """The note on what is not checked where ``can_see`` does not hold."""
+    return f"pictures, depth and masks were not looked at; for that, {extras.remedy('images')}"
 
 
 def decode_exr(data: bytes, path: Path) -> NDArray[Any]:
@@ -111,13 +134,13 @@ def container_fault(data: bytes) -> str | None:
 def _png_fault(data: bytes) -> str | None:
     at, name = len(_PNG), b""
     while name != b"IEND":
-        name, end = data[at + 4 : at + 8], at + 12 + int.from_bytes(data[at : at + 4])
+        name, end = data[at + 4 : at + 8], at + 12 + int.from_bytes(data[at : at + 4], "big")
         if len(name) < 4:
             return f"is cut off after {len(data)} bytes: it has no end chunk"
         label = name.decode("latin-1")
         if end > len(data):
             return f"is cut off inside its {label} chunk, after {len(data)} bytes"
-        if zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end]):
+        if zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
             return f"is damaged: the checksum of its {label} chunk is wrong"
         at = end
     return None if at == len(data) else f"has {len(data) - at} bytes after its end"

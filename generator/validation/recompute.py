@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,6 +32,7 @@ from synthetless.dataset.records import (
     gt_info_entry,
 )
 from synthetless.dataset.store import planned_sensor
+from synthetless.extras import cv2
 from synthetless.io.images import (
     COORDINATE_SCALE_MM,
     decode_depth,

@@ -27,7 +27,7 @@ from synthetless.validation.exports import (
     folder_tasks,
 )
 from synthetless.validation.foreign import ForeignTask, check_foreign_scene, is_adopted, notes_on, read_foreign
-from synthetless.validation.images import can_decode_exr
+from synthetless.validation.images import can_decode_exr, can_see, not_seen, see
 from synthetless.validation.recompute import check_image, check_labels, check_specs, recompute
 from synthetless.validation.records import (
     SceneRecords,
@@ -78,6 +78,8 @@ def validate(
     """
     root, exports = dataset.resolve(), tuple(path.resolve() for path in exports)
     _require(root, exports, limit)
+    if sample is None or any(path.is_dir() for path in exports):
+        see()
     with undisturbed(root):
         if is_adopted(root):
             if exports or sample is None:
@@ -239,7 +241,8 @@ def check_scene(task: SceneTask) -> SceneResult:
         tally.add(unmatched)
         image_ids, instances = tuple(scene.gt), sum(len(gt) for gt in scene.gt.values())
     recomputed = skipped = 0
-    for im_id in [plan.im_id for plan in task.plans][task.part :: task.parts]:
+    seen = [plan.im_id for plan in task.plans][task.part :: task.parts] if can_see() else []
+    for im_id in seen:
         wanted = im_id in task.recomputed and im_id in scene.gt
         expected = recompute(source, scene.spec.get(im_id)) if wanted and scene.is_complete(im_id) else None
         recomputed += expected is not None
@@ -290,6 +293,9 @@ def _check_folder(source: Source, folder: Path, run: Map, tally: Tally) -> None:
 def _notes(source: Source, images: int, recomputed: int, skipped: int) -> Iterator[str]:
     if source.has("exr") and not can_decode_exr():
         yield "exr/ was not decoded: the OpenEXR package is not installed"
+    if not can_see():
+        yield not_seen()
+        return
     if skipped:
         yield (
             f"{skipped} images could not be recomputed, their files were only compared with each other: their records "

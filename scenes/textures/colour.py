@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from synthetless.extras import cv2
 from synthetless.scenes.textures.noise import Field
 
 Image = NDArray[np.float32]  # (size, size, 3)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synthetless.extras import cv2
 from synthetless.scenes.srgb import LUMINANCE_WEIGHTS
 from synthetless.scenes.textures import masonry, natural, prints, textiles
 from synthetless.scenes.textures.colour import Image

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synthetless.extras import cv2
 from synthetless.scenes.textures.noise import Field, spectral_noise, warp_labels
 
 Labels = NDArray[np.int32]  # (size, size)

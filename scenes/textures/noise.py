@@ -6,9 +6,10 @@ tile and lengths in fractions of the tile's side, so that a seed gives the same 
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from synthetless.extras import cv2
 
 Field = NDArray[np.float32]  # (size, size)
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from synthetless.errors import UserError
+from synthetless.extras import cv2
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
 

@@ -5,10 +5,10 @@ A painter takes a random generator and a size in pixels and returns a seamless (
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synthetless.extras import cv2
 from synthetless.scenes.textures.colour import Colours, Image, mix, palette, ramp
 from synthetless.scenes.textures.noise import blur, coordinates, normalised, smoothstep, spectral_noise
 

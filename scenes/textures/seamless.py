@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from synthetless.extras import cv2
 
 _OVERLAP = 0.2
 """Share of each side that lies on the opposite border."""

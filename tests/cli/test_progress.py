@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synthetless.cli.progress import clock, display
+from synthetless.cli.progress import display
 from synthetless.generation.progress import (
     COLLIDERS,
     DONE,
@@ -120,4 +120,5 @@ def test_a_scheduler_gets_json(monkeypatch: pytest.MonkeyPatch) -> None:
     ("seconds", "shown"), [(0, "0:00"), (0.2, "0:01"), (84, "1:24"), (3600, "1:00:00"), (1e6, "277:46:40")]
 )
 def test_how_times_are_written(seconds: float, shown: str) -> None:
-    assert clock(seconds) == shown
+    told = Progress("making images", "rendering", 1, 2, images_per_hour=60.0, left_s=seconds)
+    assert str(told) == f"1 of 2 images, 60 an hour, {shown} left: rendering"

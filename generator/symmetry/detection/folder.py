@@ -7,9 +7,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
+from typing_extensions import Self
 
 from synthetless.errors import UserError
 from synthetless.io.documents import read_document, shown
@@ -220,8 +221,7 @@ def detect_folder(
         folder: holds PLY, STL, OBJ or OFF files.
         tolerance_percent: what the largest residual may be, as a share of the diameter.
         scale: what the files' coordinates are to be multiplied by to give millimetres.
-        workers: processes; one per available core if None. They are spawned: a script that calls this needs
-            ``if __name__ == "__main__"``.
+        workers: processes; one per available core if None.
         tolerances: of objects that have another one.
         quasi: what the largest residual of a larger group may be that an object has but for a detail; None for none.
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -18,6 +17,7 @@ from scipy.spatial import cKDTree
 from synthetless.annotation.instances import PosedModel
 from synthetless.annotation.raycast import RayCaster
 from synthetless.errors import UserError
+from synthetless.extras import cv2
 from synthetless.io.files import atomic_write
 from synthetless.io.images import encode_png
 from synthetless.io.meshes import TriangleMesh, read_mesh
