@@ -73,6 +73,7 @@ export.command("bop")(data.bop_command)
 app.add_typer(symmetries, name="symmetries")
 symmetries.command("detect")(labels.detect_command)
 symmetries.command("show")(labels.show_command)
+symmetries.command("carry-back")(labels.carry_back_command)
 
 
 class _PrintableFormatter(logging.Formatter):

@@ -1,4 +1,4 @@
-"""Commands about labels: relabel, adopt, ambiguity, symmetries detect and show."""
+"""Commands about labels: relabel, adopt, ambiguity; and about symmetries: detect, show, carry-back."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import typer
 
 from synthetless.cli.options import AsJson, Workers, above_zero
 from synthetless.cli.terminal import say
+from synthetless.errors import UserError
 
 TableOption = Annotated[
     Path | None,
@@ -118,6 +119,9 @@ def detect_command(
         float,
         typer.Option(callback=above_zero, metavar="FACTOR", help="Millimetres per unit of the files; 1000 for metres."),
     ] = 1.0,
+    recentre: Annotated[
+        bool, typer.Option("--recentre", help="Move the models written, so that main axes are z through the origin.")
+    ] = False,
     pictures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for a picture of each part.")] = None,
     workers: Workers = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
@@ -128,17 +132,51 @@ def detect_command(
     """
     from synthetless.symmetry.detection import Tolerance, detect_folder, parse_tolerances, report
 
+    if recentre and models_out is None:
+        raise UserError("--recentre moves the models that --models-out writes: give both")
     larger = None if quasi is None else Tolerance.parse(quasi)
     detected = detect_folder(models, tolerance_percent, scale, workers, parse_tolerances(tolerance or ()), larger)
     if out is not None:
-        detected.table().write(out)
+        detected.table(recentred=recentre).write(out)
     if models_out is not None:
-        detected.write_models(models_out)
+        detected.write_models(models_out, recentre)
     if pictures is not None:
         from synthetless.symmetry.detection.pictures import draw_detected
 
         draw_detected(detected, pictures, workers)
     say(json.dumps(detected.to_json()) if as_json else report(detected))
+    if models_out is not None and not recentre and detected.off_axis and not as_json:
+        objects = ", ".join(map(str, detected.off_axis))
+        say(
+            f"note: continuous symmetries not about x, y or z through the origin: object {objects}. happypose refuses "
+            "this models_info.json and FoundationPose misreads it; --recentre moves the models"
+        )
+
+
+def carry_back_command(
+    results: Annotated[Path, typer.Argument(help="Poses of recentred models: a result file of the BOP challenge.")],
+    models: Annotated[Path, typer.Option(metavar="DIR", help="Folder that detect --recentre wrote.")],
+    to: Annotated[Path, typer.Option(metavar="FILE", help="Result file to write, of the models as they were given.")],
+    as_json: AsJson = False,
+) -> None:
+    """Give poses of recentred models as poses of the models before."""
+    from dataclasses import replace
+
+    from synthetless.learning.results import read_results, write_results
+    from synthetless.symmetry.recentring import RECENTRED_FILE, read_recentrings
+
+    motions, estimates = read_recentrings(models), read_results(results)
+    for estimate in estimates:
+        if estimate.obj_id not in motions:
+            raise UserError(
+                f"{results}, row {estimate.row}: object {estimate.obj_id} is not in {models / RECENTRED_FILE}"
+            )
+    carried = []
+    for estimate in estimates:
+        R_m2c, t_m2c = motions[estimate.obj_id].pose_back(estimate.R_m2c, estimate.t_m2c)
+        carried.append(replace(estimate, R_m2c=R_m2c, t_m2c=t_m2c))
+    write_results(to, carried)
+    say(json.dumps({"poses": len(carried), "file": str(to)}) if as_json else f"{len(carried)} poses: {to}")
 
 
 def show_command(

@@ -15,7 +15,7 @@ from typing_extensions import Self
 from synthetless.errors import UserError
 from synthetless.io.documents import read_document, shown
 from synthetless.io.files import atomic_write, write_json
-from synthetless.io.meshes import read_mesh
+from synthetless.io.meshes import TriangleMesh, read_mesh
 from synthetless.io.models import (
     INFO_FILE,
     NAMES_FILE,
@@ -31,6 +31,7 @@ from synthetless.symmetry.detection.detect import Detected, detect, measure
 from synthetless.symmetry.detection.quasi import quasi_fit
 from synthetless.symmetry.detection.residual import GroupFit
 from synthetless.symmetry.groups import SymmetryGroup
+from synthetless.symmetry.recentring import Recentring, write_recentrings
 from synthetless.symmetry.table import QuasiSymmetry, SymmetryEntry, SymmetryTable, object_id
 
 _TOLERANCE = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(mm|%)\s*")
@@ -125,6 +126,18 @@ class DetectedObject:
         return SymmetryEntry(self.detected.answer.group, None, quasi)
 
     @property
+    def recentring(self) -> Recentring:
+        """What brings its main axis to z and its fixed point to the origin."""
+        return Recentring.of(self.detected.answer.group)
+
+    @property
+    def recentred_entry(self) -> SymmetryEntry:
+        """The object in the symmetry table of the recentred models."""
+        quasi = self.entry.quasi
+        moved = None if quasi is None else replace(quasi, group=self.recentring.group(quasi.group))
+        return SymmetryEntry(SymmetryGroup(self.detected.answer.group.name), None, moved)
+
+    @property
     def warning(self) -> str | None:
         """What is odd about its size, if anything, or that time ran out."""
         if not self.detected.is_complete:
@@ -168,9 +181,14 @@ class DetectedFolder:
             "or centimetres (--scale 10)?"
         )
 
-    def table(self, scheme: Scheme = SCHEMES[0]) -> SymmetryTable:
-        """The detected groups as a symmetry table."""
-        return SymmetryTable({o.obj_id: o.entry for o in self.objects}, scheme)
+    @property
+    def off_axis(self) -> tuple[int, ...]:
+        """The objects whose continuous symmetries are not about x, y or z through the origin."""
+        return tuple(o.obj_id for o in self.objects if _is_off_axis(o.detected.answer.group))
+
+    def table(self, scheme: Scheme = SCHEMES[0], recentred: bool = False) -> SymmetryTable:
+        """The detected groups as a symmetry table; ``recentred``: of the models that are written so."""
+        return SymmetryTable({o.obj_id: o.recentred_entry if recentred else o.entry for o in self.objects}, scheme)
 
     def to_json(self) -> dict[str, Any]:
         """Everything, as plain dicts, lists and numbers."""
@@ -179,30 +197,46 @@ class DetectedFolder:
             "tolerance_percent": self.tolerance_percent,
             "scale": self.scale,
             "warning": self.unit_warning,
+            "off_axis": list(self.off_axis),
             "objects": [_object_json(o) for o in self.objects],
         }
 
-    def write_models(self, to: Path) -> None:
+    def write_models(self, to: Path, recentred: bool = False) -> None:
         """Make a BOP models folder: `obj_%06d.ply`, in millimetres, and `models_info.json` with the detected groups.
 
         A PLY file that is already there under its name stays as it is.
+
+        Args:
+            to: the folder.
+            recentred: move each model so that its main axis is z and its fixed point the origin; `recentred.json`
+                says how.
 
         Raises:
             UserError: a file cannot be written, or the folder holds other meshes.
         """
         targets = {to / f"obj_{o.obj_id:06d}.ply": o for o in self.objects}
         for target, o in targets.items():
-            stays = target.exists() and target.samefile(o.path) and self.scale == 1
+            stays = target.exists() and target.samefile(o.path) and self.scale == 1 and not recentred
             if not stays and (target.exists() or to.resolve() == self.folder.resolve()):
                 raise UserError(f"{target}: would stand beside other meshes; give a new folder")
+        infos: dict[str, Any] = {}
         for target, o in targets.items():
+            moved = self._recentred(o) if recentred and not o.recentring.is_none else None
             if not target.exists():
-                atomic_write(target, self._ply(o))
-        write_json(to / INFO_FILE, {str(o.obj_id): _models_info(o) for o in self.objects})
+                atomic_write(target, self._ply(o) if moved is None else moved.to_ply())
+            group = o.recentred_entry.group if recentred else o.detected.answer.group
+            infos[str(o.obj_id)] = _models_info(o, o.info if moved is None else moved.bop_info(), group)
+        write_json(to / INFO_FILE, infos)
+        if recentred:
+            write_recentrings(to, {o.obj_id: o.recentring for o in self.objects})
 
     def _ply(self, o: DetectedObject) -> bytes:
         mesh = read_mesh(o.path, self.scale)
         return o.path.read_bytes() if mesh.is_verbatim else mesh.to_ply()
+
+    def _recentred(self, o: DetectedObject) -> TriangleMesh:
+        mesh = read_mesh(o.path, self.scale)
+        return TriangleMesh(o.recentring.points(mesh.vertices_mm), mesh.faces, is_verbatim=False)
 
 
 def detect_folder(
@@ -291,9 +325,16 @@ def _names(files: MeshFiles, folder: Path) -> dict[int, str]:
     return (stems if files.are_numbered else {}) | known | given
 
 
-def _models_info(o: DetectedObject) -> dict[str, Any]:
-    name = {} if o.name is None else {"name": o.name}
-    return dict(o.info) | name | o.detected.answer.group.to_bop()
+def _models_info(o: DetectedObject, sizes: Mapping[str, float], group: SymmetryGroup) -> dict[str, Any]:
+    return {**sizes, **({} if o.name is None else {"name": o.name}), **group.to_bop()}
+
+
+def _is_off_axis(group: SymmetryGroup) -> bool:
+    """Whether a reader that knows only coordinate axes through the origin takes the group for another one."""
+    return any(
+        any(symmetry["offset"]) or sorted(symmetry["axis"]) != [0, 0, 1]
+        for symmetry in group.to_bop().get("symmetries_continuous", ())
+    )
 
 
 def _object_json(o: DetectedObject) -> dict[str, Any]:
