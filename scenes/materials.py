@@ -8,15 +8,36 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetless.scenes.spec import Material, PlaneSpec, Vector
+from synthetless.scenes.spec import Material, PlaneSpec, SurfaceColours, Vector
+from synthetless.scenes.srgb import linear_of_levels
+
+_COLOURS = "colours"
+"""Name of the attribute that holds the colours of a mesh's vertices."""
 
 
-def plastic(bpy: Any, material: Material) -> Any:
-    """A bpy material of one colour."""
+def plastic(bpy: Any, material: Material, texture: Any = None) -> Any:
+    """A bpy material of one colour, or of the colours of the model's file; ``texture`` is its bpy image, if any."""
     made, nodes, links = _empty_material(bpy, "plastic")
     shader = _surface(nodes, links, material.roughness, material.specular, material.metallic)
     shader.inputs[0].default_value = (*material.albedo, 1.0)
+    if material.colour == "model":
+        colours = nodes.new("ShaderNodeAttribute" if texture is None else "ShaderNodeTexImage")
+        if texture is None:
+            colours.attribute_name = _COLOURS
+        else:
+            colours.image = texture
+        links.new(colours.outputs["Color"], shader.inputs[0])
     return made
+
+
+def add_colours(mesh: Any, colours: SurfaceColours) -> None:
+    """Give a bpy mesh of triangles the colours of its vertices, or the places of its corners in a texture."""
+    if colours.vertex_rgb is not None:
+        rgba = np.ones((len(colours.vertex_rgb), 4), dtype=np.float32)
+        rgba[:, :3] = linear_of_levels()[colours.vertex_rgb]
+        mesh.color_attributes.new(_COLOURS, "FLOAT_COLOR", "POINT").data.foreach_set("color", rgba.ravel())
+    if colours.corner_uv is not None:
+        mesh.uv_layers.new(name="uv").data.foreach_set("uv", colours.corner_uv.ravel())
 
 
 def textured(bpy: Any, plane: PlaneSpec, image: Any, seamless: bool) -> Any:
@@ -58,6 +79,16 @@ def new_image(bpy: Any, pixels: NDArray[np.uint8]) -> Any:
     image = bpy.data.images.new("texture", width, height, alpha=False)
     rgba = np.ones((height, width, 4), dtype=np.float32)
     np.divide(pixels[::-1], np.float32(255), out=rgba[..., :3])
+    image.pixels.foreach_set(rgba.ravel())
+    return image
+
+
+def new_light_image(bpy: Any, light: NDArray[np.float32]) -> Any:
+    """A bpy image of (H, W, 3) linear light, first row on top."""
+    height, width, _ = light.shape
+    image = bpy.data.images.new("light", width, height, alpha=False, float_buffer=True)
+    rgba = np.ones((height, width, 4), dtype=np.float32)
+    rgba[..., :3] = light[::-1]
     image.pixels.foreach_set(rgba.ravel())
     return image
 

@@ -18,9 +18,10 @@ from synthetless.errors import UserError
 from synthetless.scenes import blender, camera, lights, materials
 from synthetless.scenes.blender import RenderDevice
 from synthetless.scenes.container import container_mesh
+from synthetless.scenes.environments import load_panorama
 from synthetless.scenes.rotations import matrix
 from synthetless.scenes.settings import RenderSettings, TableSettings
-from synthetless.scenes.spec import Intrinsics, Mesh, Pose, Role, SceneSpec
+from synthetless.scenes.spec import AmbientLight, EnvironmentSpec, Intrinsics, Mesh, Pose, Role, SceneSpec
 from synthetless.scenes.textures import PhotoTexture, load_photo, procedural_image, seamless
 
 _CREASE_DEG = 30.0
@@ -40,6 +41,7 @@ class BlenderSession:
         threads: of the renderer; 0 uses every core.
         device: what to render on.
         log: file that takes Blender's console output.
+        panoramas: folder of the panoramas, None if none are used.
     """
 
     meshes: Mapping[tuple[Role, int], Mesh]
@@ -50,7 +52,9 @@ class BlenderSession:
     threads: int = 0
     device: RenderDevice = blender.CPU
     log: Path = Path(os.devnull)
+    panoramas: Path | None = None
     _loaded: dict[tuple[Role, int], Any] = field(default_factory=dict, init=False)
+    _textures: dict[tuple[Role, int], Any] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
         self.bpy = blender.start(self.threads, self.device)
@@ -69,7 +73,7 @@ class BlenderSession:
             settled: pose of each object of ``spec`` at rest.
 
         Raises:
-            UserError: the photograph of the table cannot be read.
+            UserError: the photograph of the table, or the panorama, cannot be read.
         """
         bpy_scene = self.bpy.context.scene
         collection = bpy_scene.collection
@@ -79,6 +83,8 @@ class BlenderSession:
             lights.add_lamp(self.bpy, collection, spec.light, centre_m)
             if spec.room is not None:
                 lights.add_room(self.bpy, collection, spec.room, spec.ambient, centre_m)
+            if spec.environment is not None:
+                self._add_panorama(bpy_scene.world, spec.environment, spec.ambient)
             self._add_table(collection, spec, centre_m)
             if spec.container is not None:
                 container = self.bpy.data.objects.new("container", _load_mesh(self.bpy, container_mesh(spec.container)))
@@ -90,14 +96,15 @@ class BlenderSession:
                 placed.pass_index = number + 1
                 collection.objects.link(placed)
                 placed.material_slots[0].link = "OBJECT"  # the mesh is shared, the grey is not
-                placed.material_slots[0].material = materials.plastic(self.bpy, item.material)
+                texture = self._textures.get((item.role, item.obj_id))
+                placed.material_slots[0].material = materials.plastic(self.bpy, item.material, texture)
             data = self.bpy.data.cameras.new("camera")
             bpy_scene.camera = self.bpy.data.objects.new("camera", data)
             collection.objects.link(bpy_scene.camera)
             camera.set_intrinsics(bpy_scene, bpy_scene.camera, self.intrinsics)
             yield BlenderScene(self, spec, centre_m)
         finally:
-            blender.clear(self.bpy, keep=set(self._loaded.values()))
+            blender.clear(self.bpy, keep={*self._loaded.values(), *self._textures.values()})
 
     def _add_table(self, collection: Any, spec: SceneSpec, centre_m: NDArray[np.float64]) -> None:
         plane, texture = spec.plane, spec.plane.texture
@@ -118,6 +125,13 @@ class BlenderSession:
         aspect = pixels.shape[1] / pixels.shape[0]
         materials.add_table(self.bpy, collection, plane, self.table.size_m, material, aspect)
 
+    def _add_panorama(self, world: Any, environment: EnvironmentSpec, ambient: AmbientLight) -> None:
+        if self.panoramas is None:
+            raise UserError(f"the scene needs the panorama {environment.file}, but no folder of them is given")
+        light = load_panorama(self.panoramas, environment.file) * np.float32(environment.strength)
+        light += ambient.level * np.array(ambient.color, dtype=np.float32)
+        lights.add_panorama(self.bpy, world, light, environment.turn_deg)
+
     def _texel_m(self, spec: SceneSpec, centre_m: NDArray[np.float64], rows: int) -> float:
         """Side of a texel of a photograph: as the tile was drawn, or no larger than a pixel where the recipe allows."""
         poses = (camera.extrinsics(view, centre_m) for view in spec.views)
@@ -128,6 +142,9 @@ class BlenderSession:
         key = (role, obj_id)
         if key not in self._loaded:
             self._loaded[key] = _load_mesh(self.bpy, self.meshes[key])
+            colours = self.meshes[key].colours
+            if colours is not None and colours.texture is not None:
+                self._textures[key] = materials.new_image(self.bpy, colours.texture)
         return self._loaded[key]
 
 
@@ -208,6 +225,8 @@ def _load_mesh(bpy: Any, mesh: Mesh) -> Any:
     made.polygons.foreach_set("use_smooth", np.ones(count, dtype=bool))
     made.update(calc_edges=True)
     made.set_sharp_from_angle(angle=math.radians(_CREASE_DEG))
+    if mesh.colours is not None:
+        materials.add_colours(made, mesh.colours)
     made.materials.append(None)
     return made
 

@@ -7,8 +7,8 @@ second throw of the same drop changes only how the objects are let go.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
@@ -33,6 +33,7 @@ from synthetless.scenes.spec import (
     AreaLight,
     ContainerKind,
     ContainerSpec,
+    EnvironmentSpec,
     Material,
     ObjectSpec,
     PlaneSpec,
@@ -68,6 +69,8 @@ class Stream(IntEnum):
     ROOM = 8
     CONTAINER = 9
     UPRIGHT = 10
+    ENVIRONMENT = 11
+    COLOUR = 12
 
 
 @dataclass(frozen=True)
@@ -79,12 +82,16 @@ class Catalogue:
         distractors: the same of the unlabelled ones.
         photos: names of the photographs for the table; empty means the built-in textures.
         standing: how each labelled model stands, where objects are to be set down upright.
+        panoramas: names of the panoramas that may light a scene.
+        coloured: role and id of the objects whose files have colours.
     """
 
     models: Mapping[int, float]
     distractors: Mapping[int, float]
     photos: Sequence[str] = ()
     standing: Mapping[int, Standing] = field(default_factory=dict)
+    panoramas: Sequence[str] = ()
+    coloured: Collection[tuple[Role, int]] = ()
 
 
 def sample_scene(settings: SceneSettings, catalogue: Catalogue, seed: int, drop: int, attempt: int = 0) -> SceneSpec:
@@ -105,7 +112,7 @@ def sample_scene(settings: SceneSettings, catalogue: Catalogue, seed: int, drop:
         return _stream(seed, drop, purpose, *further)
 
     chosen = _choose_objects(settings.objects, catalogue, stream(Stream.OBJECTS))
-    materials, metallic = stream(Stream.MATERIALS), stream(Stream.METALLIC)
+    materials, metallic, colour = (stream(of) for of in (Stream.MATERIALS, Stream.METALLIC, Stream.COLOUR))
     diameters = [(catalogue.models if role == "model" else catalogue.distractors)[i] for role, i in chosen]
     container = sample_container(settings.release.container, seed, drop)
     upright = _set_down(settings.release, catalogue, chosen, container, stream(Stream.UPRIGHT, attempt))
@@ -114,20 +121,34 @@ def sample_scene(settings: SceneSettings, catalogue: Catalogue, seed: int, drop:
         ObjectSpec(role, obj_id, _material(settings.objects, materials, metallic), pose)
         for (role, obj_id), pose in zip(chosen, releases, strict=True)
     )
+    objects = tuple(_coloured(item, settings.objects, catalogue, colour) for item in objects)
     light, ambient = _lights(settings.light, stream(Stream.LIGHT))
     views = tuple(
         _view(settings.camera, stream(Stream.VIEWS, number)) for number in range(settings.camera.views_per_drop)
     )
     plane = _plane(settings.table, catalogue.photos, stream(Stream.PLANE))
-    room = sample_room(settings.light.room, seed, drop)
-    return SceneSpec(drop, attempt, objects, plane, light, ambient, views, room, container)
+    room, environment = sample_surroundings(settings.light, catalogue.panoramas, seed, drop)
+    return SceneSpec(drop, attempt, objects, plane, light, ambient, views, room, container, environment)
 
 
-def sample_room(settings: RoomSettings | None, seed: int, drop: int) -> RoomSpec | None:
-    """Draw the room of one drop; None without settings. Arguments as for ``sample_scene``."""
-    if settings is None:
-        return None
-    rng = _stream(seed, drop, Stream.ROOM)
+def sample_surroundings(
+    settings: LightSettings, panoramas: Sequence[str], seed: int, drop: int
+) -> tuple[RoomSpec | None, EnvironmentSpec | None]:
+    """Draw what stands around the table of one drop: a room, a panorama, or nothing.
+
+    Args:
+        settings: the ranges to draw from.
+        panoramas: names of those to draw from. Only the name that is drawn depends on them.
+        seed, drop: as for ``sample_scene``.
+    """
+    rng = _stream(seed, drop, Stream.ENVIRONMENT)
+    if panoramas and float(rng.uniform()) < settings.environment_share:
+        turn_deg, strength = float(rng.uniform(0, 360)), _uniform(rng, settings.environment_strength)
+        return None, EnvironmentSpec(panoramas[int(rng.integers(len(panoramas)))], turn_deg, strength)
+    return None if settings.room is None else _room(settings.room, _stream(seed, drop, Stream.ROOM)), None
+
+
+def _room(settings: RoomSettings, rng: np.random.Generator) -> RoomSpec:
     side_m, height_m = _uniform(rng, settings.side_m), _uniform(rng, settings.height_m)
     level = _uniform(rng, settings.ceiling) / ceiling_share(side_m, height_m)
     ceiling = _tinted(level, settings.tint, rng)
@@ -235,6 +256,14 @@ def _colour(grey: FloatRange, tint: float, scale: str, rng: np.random.Generator)
     channels = (min(max(drawn + d, 0.0), 1.0) for d in deviations.tolist())
     red, green, blue = channels if scale == "linear" else map(linear_from_srgb, channels)
     return (red, green, blue)
+
+
+def _coloured(item: ObjectSpec, settings: ObjectSettings, catalogue: Catalogue, rng: np.random.Generator) -> ObjectSpec:
+    """The object in the colours of its file, if they are drawn and it has any."""
+    share = {"grey": 0.0, "mixed": 0.5, "model": 1.0}[settings.colour]
+    if float(rng.uniform()) >= share or (item.role, item.obj_id) not in catalogue.coloured:
+        return item
+    return replace(item, material=replace(item.material, colour="model"))
 
 
 def _release(

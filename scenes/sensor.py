@@ -74,7 +74,7 @@ def expose(
     light = np.minimum(np.fmax(linear, 0), _MAX_LIGHT).astype(np.float16).astype(np.float32)  # what is no number is 0
     light = blurred(light, drawn.blur_px)
     light *= _falloff(light.shape, drawn.vignetting, corner_px, frame_px) * (gain * 2.0**drawn.exposure_ev)
-    rgb = demosaicked(_photographed(_rolled_off(light, drawn.shoulder), drawn))
+    rgb = demosaicked(_photographed(rolled_off(light, drawn.shoulder), drawn))
     rgb *= np.array([drawn.red_gain, 1.0, drawn.blue_gain], dtype=np.float32)
     displayed = srgb_from_linear(_chroma_smoothed(rgb, drawn.chroma_px))
     levels = np.rint(255 * np.clip(_sharpened(displayed, drawn.sharpen, drawn.sharpen_px), 0, 1)).astype(np.uint8)
@@ -125,8 +125,11 @@ def _falloff(
     return left
 
 
-def _rolled_off(light: Light, shoulder: float) -> Light:
-    """Highlights bent, without a kink, so that they come near full scale but do not reach it; 0 cuts them off."""
+def rolled_off(light: Light, shoulder: float) -> Light:
+    """Highlights above 1 - shoulder bent, without a kink, so that they near full scale but do not reach it.
+
+    A shoulder of 0 cuts them off at full scale, 1.
+    """
     bent: Light = np.minimum(light, 1 - shoulder)
     if shoulder > 0:
         bent = bent + shoulder * (1 - np.exp((bent - light) / shoulder))

@@ -66,6 +66,9 @@ class ObjectSettings(Settings):
     """What grey and tint are measured in: values as displayed, or linear light, which gives lighter objects."""
     tint: Annotated[float, Bounds(0, 1)] = 0.0
     """Largest deviation of a colour channel from the grey; 0 keeps objects grey."""
+    colour: Literal["grey", "model", "mixed"] = "grey"
+    """Colours of the objects: the grey above; those of the model's file, of its vertices or its texture; or mixed,
+    either for each object. Distractors whose file has none are grey."""
     roughness: Annotated[FloatRange, Bounds(0, 1)] = (0.3, 0.9)
     """Surface roughness: 0 mirror-like, 1 matte."""
     specular: Annotated[FloatRange, Bounds(0, 1)] = (0.0, 0.5)
@@ -256,6 +259,14 @@ class LightSettings(Settings):
     room: Annotated[RoomSettings | None, BeforeValidator(_room_by_name)] = None
     """A room around the table, whose ceiling, walls and lamps give more light and are mirrored by what shines: none,
     ranges as below, or its settings."""
+    environments: str | None = None
+    """Folder of panoramas, linear light in .hdr or .exr files twice as wide as high, that light the scene and are
+    mirrored by what shines."""
+    environment_strength: Annotated[FloatRange, Bounds(0, 100)] = (0.3, 0.8)
+    """Linear brightness of a white matte surface that faces the zenith, under the panorama alone."""
+    environment_share: Annotated[float, Bounds(0, 1)] = 1.0
+    """Share of the drops that have a panorama, each of the folder equally often, turned at random; the others have the
+    room, if there is one."""
 
 
 class TableSettings(Settings):
@@ -296,6 +307,9 @@ class RenderSettings(Settings):
     """Reflections of light between surfaces."""
     exposure: Annotated[FloatRange, Bounds(0.01, 0.99)] = (0.15, 0.7)
     """Mean displayed luminance that an image is kept within, as a camera's automatic exposure would."""
+    shoulder: Annotated[float, Bounds(0, 0.9)] = 0.0
+    """Upper part of the linear range over which highlights roll off in images without a sensor, which has its own; 0
+    cuts them off at full scale."""
 
     @model_validator(mode="before")
     @classmethod

@@ -42,12 +42,14 @@ class Material:
         roughness: 0 mirror-like, 1 matte.
         specular: level of a dielectric's reflection, 0 none, 0.5 ordinary plastic.
         metallic: 0 a dielectric, 1 a metal.
+        colour: whether the albedo is seen ("grey", although it may have a tint), or the colours of the model's file.
     """
 
     albedo: Vector
     roughness: float
     specular: float
     metallic: float = 0.0
+    colour: Literal["grey", "model"] = "grey"
 
 
 @dataclass(frozen=True)
@@ -143,6 +145,21 @@ class RoomSpec:
 
 
 @dataclass(frozen=True)
+class EnvironmentSpec:
+    """Light from all around, from a panorama.
+
+    Attributes:
+        file: the panorama, relative to its folder, with forward slashes.
+        turn_deg: azimuth at which its middle column is seen.
+        strength: luminance of a white matte surface that faces the zenith.
+    """
+
+    file: str
+    turn_deg: float
+    strength: float
+
+
+@dataclass(frozen=True)
 class AmbientLight:
     """Light from everywhere: ``level`` is the linear brightness of a white matte surface under it alone."""
 
@@ -182,6 +199,7 @@ class SceneSpec:
     views: tuple[View, ...]
     room: RoomSpec | None = None
     container: ContainerSpec | None = None
+    environment: EnvironmentSpec | None = None
 
 
 def plain(spec: Any) -> Any:
@@ -261,6 +279,22 @@ class Standing:
 
 
 @dataclass(frozen=True, eq=False)
+class SurfaceColours:
+    """The colours that a model's file gives its surface: those of the vertices, or a texture.
+
+    Attributes:
+        vertex_rgb: (V, 3) sRGB; None if there is a texture.
+        texture: (H, W, 3) sRGB, first row on top; None if the vertices have colours.
+        corner_uv: (F, 3, 2) float32 place in the texture of each corner of each face: u to the right, v upwards, 0..1,
+            repeated beyond; None without a texture.
+    """
+
+    vertex_rgb: NDArray[np.uint8] | None = None
+    texture: NDArray[np.uint8] | None = None
+    corner_uv: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Mesh:
     """A triangle mesh in the model frame, as the renderer and the physics see it.
 
@@ -268,8 +302,10 @@ class Mesh:
         vertices_m: (V, 3) float64, metres.
         faces: (F, 3) int32 indices into the vertices, counter-clockwise seen from outside.
         normals: (V, 3) float64 unit vertex normals, or None where the file has none.
+        colours: of its surface, or None where they are not needed or the file has none.
     """
 
     vertices_m: NDArray[np.float64]
     faces: NDArray[np.int32]
     normals: NDArray[np.float64] | None = None
+    colours: SurfaceColours | None = None

@@ -20,6 +20,11 @@ def srgb_from_linear(linear: NDArray[Real]) -> NDArray[Real]:
     return result
 
 
+def linear_of_levels() -> NDArray[np.float32]:
+    """(256,) linear light of the levels of an 8-bit image."""
+    return np.array([linear_from_srgb(level / 255) for level in range(256)], dtype=np.float32)
+
+
 def linear_from_srgb(displayed: float) -> float:
     """Linear light of a displayed value in 0..1."""
     return displayed / 12.92 if displayed <= 0.04045 else ((displayed + 0.055) / 1.055) ** 2.4

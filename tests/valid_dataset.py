@@ -93,7 +93,7 @@ def small_scene_folders() -> Iterator[None]:
 def write_dataset(root: Path, models_folder: Path, overrides: Sequence[str] = (), seed: int = 5) -> DatasetStore:
     """A complete dataset of random colours and true everything else."""
     recipe = load_recipe(None, [*RECIPE, f"seed={seed}", *overrides])
-    maker = _Maker(recipe, load_models(models_folder))
+    maker = _Maker(recipe, load_models(models_folder, colours=recipe.objects.colour != "grey"))
     dataset = DatasetStore.open(root, recipe, maker.models, "")
     for drop, plans in by_drop(range(recipe.images), recipe.camera.views_per_drop):
         for image in maker.make(drop, plans):

@@ -99,7 +99,7 @@ def ambiguity_command(
 
 
 def detect_command(
-    models: Annotated[Path, typer.Argument(help="Folder of PLY, STL, OBJ or OFF files.")],
+    models: Annotated[Path, typer.Argument(help="Folder of PLY, STL, OBJ, OFF or GLB files.")],
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Symmetry table to write.")] = None,
     models_out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="BOP models folder to write, models_info.json too.")
@@ -122,6 +122,9 @@ def detect_command(
     recentre: Annotated[
         bool, typer.Option("--recentre", help="Move the models written, so that main axes are z through the origin.")
     ] = False,
+    colours: Annotated[
+        bool, typer.Option("--colours", help="Keep colours and textures of the meshes in --models-out.")
+    ] = False,
     pictures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for a picture of each part.")] = None,
     workers: Workers = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
@@ -139,7 +142,7 @@ def detect_command(
     if out is not None:
         detected.table(recentred=recentre).write(out)
     if models_out is not None:
-        detected.write_models(models_out, recentre)
+        detected.write_models(models_out, recentre, colours)
     if pictures is not None:
         from synthetless.symmetry.detection.pictures import draw_detected
 

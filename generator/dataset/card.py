@@ -20,6 +20,7 @@ from synthetless.dataset.layout import CARD_FILE, DATASET_FILE, MODELS_FOLDER, S
 from synthetless.dataset.reader import Scene, read_recipe
 from synthetless.io.files import atomic_write, read_json
 from synthetless.io.models import object_names, read_models_info
+from synthetless.scenes.settings import LightSettings
 from synthetless.symmetry import SymmetryTable
 
 _BUILTIN_LICENCE = "The built-in parts of SyntheT-Less, own work, CC0 1.0"
@@ -208,6 +209,7 @@ def _making(recipe: Recipe) -> str:
         ("table", "procedural textures" if recipe.source.textures == BUILTIN else "photographs"),
         ("lamp", f"{_span(light.elevation_deg)}° above the table, strength {_span(light.strength)}"),
         ("ambient light", _span(light.ambient)),
+        *_around(light),
         ("visible", _visibility(recipe.labels.visibility_delta_mm)),
         ("samples a pixel", f"{recipe.render.samples}, denoiser {recipe.render.denoiser}"),
     ]
@@ -219,6 +221,13 @@ def _containers(recipe: Recipe) -> list[tuple[str, str]]:
     kinds = (("box", of.box), ("tray", of.tray))
     named = [f"{asked.share:.0%} of the drops in a {kind}" for kind, asked in kinds if asked.share > 0]
     return [("containers", ", ".join(named))] if named else []
+
+
+def _around(light: LightSettings) -> list[tuple[str, str]]:
+    """What stands around the table, if anything does."""
+    around = [] if light.room is None else [f"a lit room with {_span(light.room.lamps)} soft lamps"]
+    around += [] if light.environments is None else [f"panoramas, in {light.environment_share:.0%} of the drops"]
+    return [("around the table", "; ".join(around))] if around else []
 
 
 def _visibility(delta_mm: float) -> str:

@@ -7,6 +7,7 @@ them, at any time and as often as one likes.
 
 from __future__ import annotations
 
+import hashlib
 import re
 import shutil
 from collections.abc import Mapping, Sequence
@@ -42,7 +43,7 @@ from synthetless.errors import UserError
 from synthetless.io import images
 from synthetless.io.color import exposure_gain, picture
 from synthetless.io.files import atomic_write, in_turn, read_json, replace_file, write_json, write_json_lines
-from synthetless.io.models import INFO_FILE, ObjectModel, object_names, read_models_info
+from synthetless.io.models import INFO_FILE, ObjectModel, object_names, read_models_info, texture_file
 from synthetless.scenes.sampling import sample_sensor
 from synthetless.scenes.spec import Pose, SceneSpec, SensorSpec
 from synthetless.symmetry import SymmetryTable
@@ -90,7 +91,7 @@ class FinishedImage:
             linear: (H, W, 3) rendered light, Rec. 709 primaries; None if nothing was rendered.
         """
         gain = 1.0 if linear is None else exposure_gain(linear, recipe.render.exposure)
-        rgb = None if linear is None else picture(linear, gain, planned_sensor(recipe, plan))
+        rgb = None if linear is None else picture(linear, gain, planned_sensor(recipe, plan), recipe.render.shoulder)
         files = _encode(recipe, plan.im_id, annotated.image, rgb, linear)
         return cls(plan, files, image_record(recipe, plan, scene, settled, annotated, gain))
 
@@ -292,8 +293,11 @@ class DatasetStore:
         """camera.json, the models and symmetries.json; what is there already stays as it is."""
         folder = self.root / MODELS_FOLDER
         for model in models.values():
-            if not (folder / model.path.name).exists():
-                atomic_write(folder / model.path.name, model.to_ply())
+            files = {model.path.name: model.to_ply, texture_file(model.obj_id): model.to_png}
+            for name, encode in files.items():
+                encoded = None if (folder / name).exists() else encode()
+                if encoded is not None:
+                    atomic_write(folder / name, encoded)
         infos = {str(obj_id): dict(model.info) for obj_id, model in models.items()}
         camera = records.camera_json(self.recipe.intrinsics, self.recipe.encoding.depth_scale)
         for path, content in ((folder / INFO_FILE, infos), (self.root / CAMERA_FILE, camera)):
@@ -346,10 +350,18 @@ def _header(recipe: Recipe, models: Mapping[int, ObjectModel], scenery_digest: s
         "recipe": dump_recipe(recipe),
         "versions": versions(),
         "models_sha256": {str(obj_id): model.digest for obj_id, model in models.items()},
+        **_textures(models),
         "scenery_digest": scenery_digest,
         "licence": recipe.source.licence,
         "counts": {"images": 0, "instances": 0},
     }
+
+
+def _textures(models: Mapping[int, ObjectModel]) -> dict[str, dict[str, str]]:
+    """What dataset.json says of the models' textures, if there are any."""
+    textures = {str(obj_id): png for obj_id, model in models.items() if (png := model.to_png()) is not None}
+    digests = {obj_id: hashlib.sha256(png).hexdigest() for obj_id, png in textures.items()}
+    return {"textures_sha256": digests} if digests else {}
 
 
 def versions() -> dict[str, str]:
@@ -376,8 +388,8 @@ def make_folder(root: Path) -> None:
 
 def _refuse_other(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Continue only what would come out the same had it never been interrupted."""
-    for key in ("versions", "models_sha256", "scenery_digest"):
-        if before.get(key) != now[key]:
+    for key in ("versions", "models_sha256", "textures_sha256", "scenery_digest"):
+        if before.get(key) != now.get(key):
             raise DatasetError(f"{path}: was begun with other {key} than now; use another output folder")
     old, new = _flat(before["recipe"]), _flat(now["recipe"])
     for key in sorted(old.keys() | new.keys()):

@@ -58,7 +58,9 @@ class DropRenderer:
         models = {(role, obj_id): model for role, of in sources.by_role.items() for obj_id, model in of.items()}
         self._recipe = recipe
         self._catalogue = sources.catalogue
-        self._meshes = {key: Mesh(model.vertices_mm / _MM, model.faces) for key, model in models.items()}
+        self._meshes = {
+            key: Mesh(model.vertices_mm / _MM, model.faces, colours=model.colours) for key, model in models.items()
+        }
         self._colliders: dict[ModelKey, Collider] = {}
         self._cache = Cache.default()
         self._caster = scene_caster(sources.by_role)
@@ -71,6 +73,7 @@ class DropRenderer:
             threads,
             device,
             log,
+            sources.panoramas_folder,
         )
 
     def make(self, drop: int, plans: Sequence[ImagePlan], report: Report = unreported) -> Iterator[FinishedImage]:

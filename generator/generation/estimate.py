@@ -15,7 +15,7 @@ from synthetless.generation import devices
 from synthetless.generation.drop import DropRenderer
 from synthetless.generation.generate import Execution, wanted
 from synthetless.generation.progress import READING, STARTING, Tell, Tracker, silent
-from synthetless.generation.sources import Sources, check_photos, load_sources
+from synthetless.generation.sources import Sources, check_pictures, load_sources
 from synthetless.io.files import nearest_existing
 
 _PROBES = 2
@@ -81,7 +81,7 @@ def estimate(recipe: Recipe, out: Path, execution: Execution, tell: Tell = silen
     tracker = Tracker(tell)
     tracker.phase(READING)
     sources = load_sources(recipe)
-    check_photos(sources, tracker)
+    check_pictures(sources, tracker)
     dataset = DatasetStore(out, recipe)
     if (out / DATASET_FILE).exists():
         dataset = DatasetStore.begun(out, recipe, sources.models, sources.scenery_digest)

@@ -21,7 +21,7 @@ from synthetless.generation.devices import CPU, Devices
 from synthetless.generation.drop import DropRenderer
 from synthetless.generation.executors import DropResult, DropTask, WorkerConfig
 from synthetless.generation.progress import DONE, FINISHING, READING, Tell, Tracker, silent
-from synthetless.generation.sources import Sources, check_photos, load_sources
+from synthetless.generation.sources import Sources, check_pictures, load_sources
 from synthetless.io.files import in_turn, locked, remove_file, write_json
 from synthetless.io.parallel import usable_cores
 from synthetless.scenes.sampling import sample_scene
@@ -96,7 +96,7 @@ def generate(recipe: Recipe, out: Path, execution: Execution, tell: Tell = silen
     tracker.phase(READING)
     sources = load_sources(recipe, tracker)
     if not (out / DATASET_FILE).exists():
-        check_photos(sources, tracker)
+        check_pictures(sources, tracker)
         make_folder(out)
     with locked(out, execution.part.name if execution.part else None):
         with in_turn(out):  # parts that begin at the same moment must be parts of one recipe

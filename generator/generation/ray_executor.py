@@ -99,6 +99,8 @@ def run(
     sources = load_sources(config.recipe)
     if sources.photos_folder is not None:
         sources = replace(sources, photos_folder=sources.photos_folder.absolute())
+    if sources.panoramas_folder is not None:  # they are large: a folder that all nodes can read is needed
+        sources = replace(sources, panoramas_folder=sources.panoramas_folder.absolute())
     config = replace(config, root=config.root.absolute())
     token = config.root / LOGS_FOLDER / f"shared-{uuid4().hex}"
     with connected(address or "auto") as ray:

@@ -42,11 +42,11 @@ def render_again(dataset: Path, scene_id: int, im_id: int, textures: Path | None
     image = recorded[im_id]
     if textures is None and recipe.source.textures != BUILTIN:
         textures = Path(recipe.source.textures)
-    session = BlenderSession(
-        _meshes(dataset, recipe, image.scene), recipe.intrinsics, recipe.render, recipe.table, textures
-    )
+    panoramas = None if recipe.light.environments is None else Path(recipe.light.environments)
+    meshes = _meshes(dataset, recipe, image.scene)
+    session = BlenderSession(meshes, recipe.intrinsics, recipe.render, recipe.table, textures, panoramas=panoramas)
     with session.scene(image.scene, image.settled) as scene:
-        return picture(scene.render(image.view), image.exposure_gain, image.sensor)
+        return picture(scene.render(image.view), image.exposure_gain, image.sensor, recipe.render.shoulder)
 
 
 def _meshes(dataset: Path, recipe: Recipe, scene: SceneSpec) -> Mapping[tuple[Role, int], Mesh]:
@@ -56,6 +56,10 @@ def _meshes(dataset: Path, recipe: Recipe, scene: SceneSpec) -> Mapping[tuple[Ro
     meshes: dict[tuple[Role, int], Mesh] = {}
     for role, folder in folders.items():
         ids = tuple({item.obj_id for item in scene.objects if item.role == role})
-        models: Mapping[int, ObjectModel] = load_models(folder, ids) if ids else {}
-        meshes |= {(role, obj_id): Mesh(model.vertices_mm / 1000, model.faces) for obj_id, model in models.items()}
+        colours = any(item.role == role and item.material.colour == "model" for item in scene.objects)
+        models: Mapping[int, ObjectModel] = load_models(folder, ids, colours) if ids else {}
+        meshes |= {
+            (role, obj_id): Mesh(model.vertices_mm / 1000, model.faces, colours=model.colours)
+            for obj_id, model in models.items()
+        }
     return meshes

@@ -1,4 +1,4 @@
-"""What a dataset is made from: models, distractors and photographs, found and checked before anything is written."""
+"""What a dataset is made from: models, distractors and pictures, found and checked before anything is written."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from synthetless.generation.progress import Tracker
 from synthetless.io.cache import Cache, digest
 from synthetless.io.models import ObjectModel, load_models
 from synthetless.scenes.collider import VERSION, Collider, collider, standing
+from synthetless.scenes.environments import list_panoramas, load_panorama
 from synthetless.scenes.sampling import Catalogue
 from synthetless.scenes.settings import BoxSettings
 from synthetless.scenes.spec import Mesh, Role, Standing
@@ -35,6 +36,8 @@ class Sources:
         photos: names of the photographs for the table, relative to ``photos_folder``; empty for built-in textures.
         photos_folder: where they are.
         standing: how each labelled model stands, if the recipe sets objects down.
+        panoramas: names of the panoramas that light scenes, relative to ``panoramas_folder``.
+        panoramas_folder: where they are; None if none are asked for.
     """
 
     models: Mapping[int, ObjectModel]
@@ -42,6 +45,8 @@ class Sources:
     photos: tuple[str, ...]
     photos_folder: Path | None
     standing: Mapping[int, Standing] = field(default_factory=dict)
+    panoramas: tuple[str, ...] = ()
+    panoramas_folder: Path | None = None
 
     @property
     def by_role(self) -> dict[Role, Mapping[int, ObjectModel]]:
@@ -55,40 +60,60 @@ class Sources:
         def diameters(models: Mapping[int, ObjectModel]) -> dict[int, float]:
             return {obj_id: model.diameter_mm / 1000 for obj_id, model in models.items()}
 
-        return Catalogue(diameters(self.models), diameters(self.distractors), self.photos, self.standing)
+        models = ((role, i, model) for role, of in self.by_role.items() for i, model in of.items())
+        coloured = frozenset((role, i) for role, i, model in models if model.colours is not None)
+        return Catalogue(
+            diameters(self.models), diameters(self.distractors), self.photos, self.standing, self.panoramas, coloured
+        )
 
     @property
     def scenery_digest(self) -> str:
-        """SHA-256 of what surrounds the models: names and sizes of the photographs, meshes of the distractors."""
+        """SHA-256 of what surrounds the models: names and sizes of the pictures, meshes of the distractors."""
         listing = [f"distractor {obj_id} {model.digest}" for obj_id, model in self.distractors.items()]
+        textures = ((obj_id, model.to_png()) for obj_id, model in self.distractors.items())
+        listing += [f"texture {obj_id} {hashlib.sha256(png).hexdigest()}" for obj_id, png in textures if png]
         if self.photos_folder is not None:
             listing += [f"photo {name} {(self.photos_folder / name).stat().st_size}" for name in self.photos]
+        if self.panoramas_folder is not None:
+            listing += [f"panorama {name} {(self.panoramas_folder / name).stat().st_size}" for name in self.panoramas]
         return hashlib.sha256("\n".join(listing).encode()).hexdigest()
 
 
 def load_sources(recipe: Recipe, tracker: Tracker | None = None) -> Sources:
-    """Find and check the recipe's models, distractors and photographs; the tracker is told what takes long.
+    """Find and check the recipe's models and distractors, and find its pictures; the tracker is told what takes long.
 
     Raises:
         UserError: one of them is missing or cannot be used.
     """
     _check_room(recipe)
-    models = load_models(models_folder(recipe.source.models), recipe.objects.ids)
+    colours = recipe.objects.colour != "grey"
+    models = load_models(models_folder(recipe.source.models), recipe.objects.ids, colours)
     for obj_id, model in models.items():
         _check_symmetries(obj_id, model)
+        if recipe.objects.colour == "model" and model.colours is None:
+            raise RecipeError(
+                f"objects.colour = model: {model.path} has neither vertex colours nor a texture; give one that has, "
+                "leave it out with objects.ids, or set objects.colour to mixed"
+            )
     distractors: Mapping[int, ObjectModel] = {}
     if recipe.objects.distractors[1] > 0:
         if recipe.source.distractors is None:
             raise RecipeError(
                 f"objects.distractors = {list(recipe.objects.distractors)} needs source.distractors, a models folder"
             )
-        distractors = load_models(models_folder(recipe.source.distractors))
+        distractors = load_models(models_folder(recipe.source.distractors), None, colours)
     _check_containers(recipe, models, distractors)
-    stands = _standing(models, tracker) if recipe.release.upright > 0 else {}
-    if recipe.source.textures == BUILTIN:
-        return Sources(models, distractors, (), None, stands)
-    folder = Path(recipe.source.textures)
-    return Sources(models, distractors, list_photos(folder), folder, stands)
+    photos_folder = None if recipe.source.textures == BUILTIN else Path(recipe.source.textures)
+    panoramas_folder = None if recipe.light.environments is None else Path(recipe.light.environments)
+    return Sources(
+        models,
+        distractors,
+        () if photos_folder is None else list_photos(photos_folder),
+        photos_folder,
+        _standing(models, tracker) if recipe.release.upright > 0 else {},
+        () if panoramas_folder is None else list_panoramas(panoramas_folder),
+        panoramas_folder,
+    )
 
 
 def cached_collider(mesh: Mesh, cache: Cache) -> Collider:
@@ -163,8 +188,8 @@ def _check_room(recipe: Recipe) -> None:
             )
 
 
-def check_photos(sources: Sources, tracker: Tracker) -> None:
-    """Decode every photograph once, so that a damaged one is found before the run and not in the middle of it.
+def check_pictures(sources: Sources, tracker: Tracker) -> None:
+    """Decode every photograph and panorama once, so that a damaged one is found before the run, not in its middle.
 
     Raises:
         UserError: one cannot be decoded.
@@ -173,6 +198,10 @@ def check_photos(sources: Sources, tracker: Tracker) -> None:
         for number, name in enumerate(sources.photos, start=1):
             tracker.phase("checking textures", f"{number} of {len(sources.photos)}")
             load_photo(sources.photos_folder, name)
+    if sources.panoramas_folder is not None:
+        for number, name in enumerate(sources.panoramas, start=1):
+            tracker.phase("checking panoramas", f"{number} of {len(sources.panoramas)}")
+            load_panorama(sources.panoramas_folder, name)
 
 
 def _check_symmetries(obj_id: int, model: ObjectModel) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetless.scenes.sensor import expose
+from synthetless.scenes.sensor import expose, rolled_off
 from synthetless.scenes.spec import SensorSpec
-from synthetless.scenes.srgb import LUMINANCE_WEIGHTS, linear_from_srgb, srgb_from_linear
+from synthetless.scenes.srgb import LUMINANCE_WEIGHTS, linear_of_levels, srgb_from_linear
 
 _GAIN_STEPS = 24
 
@@ -43,12 +43,15 @@ def tonemap(linear: NDArray[np.float32], gain: float) -> NDArray[np.uint8]:
     return displayed
 
 
-def picture(linear: NDArray[np.float32], gain: float, sensor: SensorSpec | None) -> NDArray[np.uint8]:
-    """The image that is stored: as a camera takes it, or, without one, the plain tone mapping."""
-    return tonemap(linear, gain) if sensor is None else expose(linear, sensor, gain)
+def picture(
+    linear: NDArray[np.float32], gain: float, sensor: SensorSpec | None, shoulder: float = 0.0
+) -> NDArray[np.uint8]:
+    """The image that is stored: as a camera takes it, or, without one, the plain tone mapping, after a shoulder."""
+    if sensor is not None:
+        return expose(linear, sensor, gain)
+    return tonemap(rolled_off(linear * np.float32(gain), shoulder), 1.0) if shoulder else tonemap(linear, gain)
 
 
 def mean_luminance(rgb: NDArray[np.uint8]) -> float:
     """Mean displayed luminance, 0..1, of an (H, W, 3) sRGB image: what a recipe's render.exposure bounds."""
-    linear = np.array([linear_from_srgb(level / 255) for level in range(256)], dtype=np.float32)
-    return float(srgb_from_linear(linear[rgb] @ LUMINANCE_WEIGHTS).mean())
+    return float(srgb_from_linear(linear_of_levels()[rgb] @ LUMINANCE_WEIGHTS).mean())

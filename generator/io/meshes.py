@@ -1,19 +1,21 @@
-"""Mesh files: PLY, STL, OBJ and OFF, read as triangles; the only mesh reader of the project.
+"""Mesh files: PLY, STL, OBJ, OFF and GLB, read as triangles; the only mesh reader of the project.
 
 Libraries were tried first. trimesh (5.2) cuts concave polygons into overlapping triangles and refuses polygons of
 several sizes in one PLY file, spare bytes and Latin-1 comments; meshio (5.3) fails on these, too, and on a list called
 vertex_index. They take three and six times as long for the text of the T-LESS models. Polygons are cut by Manifold's
-triangulator, which keeps every corner, also those on a straight edge.
+triangulator, which keeps every corner, also those on a straight edge. GLB files, which have triangles only, are read
+by trimesh.
 """
 
 from __future__ import annotations
 
+import io
 import re
 import stat
 import struct
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synthetless.errors import UserError
+from synthetless.extras import need
+from synthetless.io.paint import Paint, PaintFault, linear_factor, one_texture, read_mtl, read_picture
+from synthetless.scenes.spec import SurfaceColours
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -46,11 +51,15 @@ class TriangleMesh:
         faces: (F, 3) vertex numbers, counterclockwise seen from outside; polygons are cut in their place.
         is_verbatim: whether the file is a PLY file that holds exactly these vertices and triangles, so that a copy of
             it is this mesh for every other reader.
+        colours: of its surface, if they were asked for and the file has any.
+        texture_file: the name by which a PLY file calls its texture.
     """
 
     vertices_mm: Floats
     faces: Ints
     is_verbatim: bool
+    colours: SurfaceColours | None = None
+    texture_file: str | None = None
 
     @cached_property
     def is_flat(self) -> bool:
@@ -70,18 +79,32 @@ class TriangleMesh:
         entry |= {f"min_{axis}": float(value) for axis, value in zip("xyz", low, strict=True)}
         return entry | {f"size_{axis}": float(value) for axis, value in zip("xyz", size, strict=True)}
 
-    def to_ply(self) -> bytes:
-        """A binary PLY file; coordinates are floats where that loses nothing, else doubles."""
+    def to_ply(self, texture_file: str = "") -> bytes:
+        """A binary PLY file; coordinates are floats where that loses nothing, else doubles.
+
+        Colours are written as BOP has them: of vertices, or texture coordinates and the name of the texture's file.
+        """
         exact = bool((self.vertices_mm.astype(np.float32) == self.vertices_mm).all())
         kind, code = ("float", "<f4") if exact else ("double", "<f8")
+        colours = self.colours or SurfaceColours()
+        named = f"comment TextureFile {texture_file}\n" if colours.texture is not None else ""
+        rgb = "".join(f"property uchar {name}\n" for name in _RGB) if colours.vertex_rgb is not None else ""
+        uv = "property list uchar float texcoord\n" if colours.corner_uv is not None else ""
         header = (
-            f"ply\nformat binary_little_endian 1.0\nelement vertex {len(self.vertices_mm)}\n"
-            f"property {kind} x\nproperty {kind} y\nproperty {kind} z\n"
-            f"element face {len(self.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+            f"ply\nformat binary_little_endian 1.0\n{named}element vertex {len(self.vertices_mm)}\n"
+            f"property {kind} x\nproperty {kind} y\nproperty {kind} z\n{rgb}"
+            f"element face {len(self.faces)}\nproperty list uchar int vertex_indices\n{uv}end_header\n"
         )
-        rows = np.empty(len(self.faces), [("count", "u1"), ("corners", "<i4", (3,))])
+        vertices = np.empty(len(self.vertices_mm), [("xyz", code, (3,)), *([("rgb", "u1", (3,))] if rgb else [])])
+        vertices["xyz"] = self.vertices_mm
+        if colours.vertex_rgb is not None:
+            vertices["rgb"] = colours.vertex_rgb
+        places = [("uv_count", "u1"), ("uv", "<f4", (6,))] if uv else []
+        rows = np.empty(len(self.faces), [("count", "u1"), ("corners", "<i4", (3,)), *places])
         rows["count"], rows["corners"] = 3, self.faces
-        return header.encode() + self.vertices_mm.astype(code).tobytes() + rows.tobytes()
+        if colours.corner_uv is not None:
+            rows["uv_count"], rows["uv"] = 6, colours.corner_uv.reshape(-1, 6)
+        return header.encode() + vertices.tobytes() + rows.tobytes()
 
 
 def diameter(points: Floats) -> float:
@@ -108,8 +131,8 @@ def _principal_extents(points: Floats) -> Floats:
     return np.pad(extents, (0, 3 - len(extents)))  # fewer than three points span as few directions
 
 
-def read_mesh(path: Path, scale: float = 1.0) -> TriangleMesh:
-    """Read a PLY, STL, OBJ or OFF file, told by the end of its name.
+def read_mesh(path: Path, scale: float = 1.0, colours: bool = False) -> TriangleMesh:
+    """Read a PLY, STL, OBJ, OFF or GLB file, told by the end of its name.
 
     Polygons may be concave and a little warped, and of any number of corners; they are cut into triangles that cover
     them exactly. Vertices that no face uses are dropped.
@@ -117,10 +140,13 @@ def read_mesh(path: Path, scale: float = 1.0) -> TriangleMesh:
     Args:
         path: of the file.
         scale: what its coordinates are multiplied by to give millimetres.
+        colours: whether to read the colours of its surface, too: those of vertices (PLY, OBJ, GLB), or its materials'
+            colours and textures (OBJ, GLB; one texture of PLY files, as BOP has it).
 
     Raises:
         UserError: it cannot be read, is damaged, has no faces, a coordinate that is not finite, or a polygon that
-            crosses itself. The message names the file, what is wrong with it, and the line or the face.
+            crosses itself; a file of materials or a texture that it names is missing or cannot be decoded. The message
+            names the file, what is wrong with it, and the line or the face.
     """
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
@@ -133,8 +159,8 @@ def read_mesh(path: Path, scale: float = 1.0) -> TriangleMesh:
         raise UserError(f"{path}: cannot be read ({error.strerror})") from None
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused by name
-            return _mesh_of(reader(data), scale)
-    except _Fault as fault:
+            return _mesh_of(reader(data, path.parent if colours else None), scale)
+    except (_Fault, PaintFault) as fault:
         raise UserError(f"{path}: {fault}") from None
 
 
@@ -151,12 +177,22 @@ class _Polygons:
         corners: (C,) vertex numbers, polygon after polygon.
         sizes: (P,) how many corners each polygon has.
         is_plain: whether any reader of PLY files understands the file.
+        rgb: (V, 3) colours of the vertices, 0..1, displayed.
+        uv: (C, 2) places of the corners in their polygon's picture, NaN where they have none.
+        paints: that polygons have.
+        paint_of: (P,) number of the paint of each polygon.
+        texture_file: the name by which a PLY file calls its texture.
     """
 
     vertices: Floats
     corners: Ints
     sizes: Ints
     is_plain: bool = False
+    rgb: Floats | None = None
+    uv: Floats | None = None
+    paints: Sequence[Paint] = ()
+    paint_of: Ints | None = None
+    texture_file: str | None = None
 
 
 def _mesh_of(polygons: _Polygons, scale: float) -> TriangleMesh:
@@ -170,15 +206,32 @@ def _mesh_of(polygons: _Polygons, scale: float) -> TriangleMesh:
     bad = np.flatnonzero(used & ~(np.abs(vertices) < _LARGEST).all(axis=1))
     if len(bad):
         raise _Fault(f"vertex {bad[0]} is {vertices[bad[0]].tolist()}; every coordinate must be finite")
-    faces = _triangulate(vertices, corners, polygons.sizes)
-    if len(faces) == 0:
+    numbered = _triangulate(vertices[corners], np.arange(len(corners)), polygons.sizes)
+    if len(numbered) == 0:
         raise _Fault("holds no faces; a triangle mesh is needed")
+    faces = corners[numbered]
     used[:] = False
     used[faces] = True
+    colours = _colours_of(polygons, numbered, used)
     if not used.all():
         vertices, faces = vertices[used], (np.cumsum(used) - 1)[faces]
     is_verbatim = polygons.is_plain and scale == 1 and bool(used.all() and (polygons.sizes == 3).all())
-    return TriangleMesh(np.ascontiguousarray(vertices * scale), faces, is_verbatim)
+    scaled = np.ascontiguousarray(vertices * scale)
+    return TriangleMesh(scaled, faces, is_verbatim, colours, polygons.texture_file)
+
+
+def _colours_of(polygons: _Polygons, triangles: Ints, used: NDArray[np.bool_]) -> SurfaceColours | None:
+    """The colours of triangles (F, 3) of corners: a texture, or else vertex colours, or else flat colours."""
+    has_picture = any(paint.picture is not None for paint in polygons.paints)
+    if polygons.rgb is not None and not has_picture:
+        return SurfaceColours(vertex_rgb=np.rint(255 * np.clip(polygons.rgb[used], 0, 1)).astype(np.uint8))
+    if polygons.paint_of is None:
+        return None
+    owner = np.repeat(np.arange(len(polygons.sizes)), polygons.sizes)[triangles[:, 0]]
+    uv = np.full((len(polygons.corners), 2), np.nan) if polygons.uv is None else polygons.uv
+    corner_uv = uv[triangles].astype(np.float32)
+    texture, corner_uv = one_texture(polygons.paints, polygons.paint_of[owner], corner_uv)
+    return SurfaceColours(texture=texture, corner_uv=corner_uv)
 
 
 # Polygons
@@ -275,6 +328,9 @@ _PLY_TYPES = {
 }
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _FACE_LISTS = ("vertex_indices", "vertex_index")
+_RGB = ("red", "green", "blue")
+_UV = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
+_FULL_SCALE = {"u1": 255.0, "u2": 65535.0}
 
 
 @dataclass(frozen=True)
@@ -302,10 +358,13 @@ class _Element:
         return _Fault(f"cut off after {row} of {self.count} rows of {self.name}")
 
 
-def _read_ply(data: bytes) -> _Polygons:
+def _read_ply(data: bytes, folder: Path | None) -> _Polygons:
     header, order, elements = _ply_header(data)
     body = _AsciiBody(data, header) if order == "" else _BinaryBody(data, header, order)
     vertices, corners, sizes = np.empty((0, 3)), np.empty(0), np.empty(0, np.int64)
+    rgb: Floats | None = None
+    vertex_uv: Floats | None = None
+    corner_uv: Floats | None = None
     for element in elements:
         table = body.read(element)
         if element.name == "tristrips":
@@ -317,15 +376,37 @@ def _read_ply(data: bytes) -> _Polygons:
             if -1 in columns or any(element.properties[i].length_type for i in columns):
                 raise _Fault("its vertices have no properties x, y and z")
             vertices = np.column_stack([table.values(i) for i in columns])
+            rgb = _ply_columns(element, table, _RGB)
+            vertex_uv = next((uv for names in _UV if (uv := _ply_columns(element, table, names)) is not None), None)
         elif element.name == "face":
             column = element.column(*_FACE_LISTS)
             if column < 0 or element.properties[column].length_type is None:
                 raise _Fault(f"its faces have no list called {' or '.join(_FACE_LISTS)}")
             corners, sizes = table.values(column), table.lengths[column]
+            places = element.column("texcoord")
+            if places >= 0 and (table.lengths[places] == 2 * sizes).all():
+                corner_uv = table.values(places).reshape(-1, 2)
     numbers = corners.astype(np.int64)
     if (numbers != corners).any():
         raise _Fault(f"a face names vertex {corners[numbers != corners][0]:g}; whole numbers are needed")
-    return _Polygons(vertices, numbers, sizes, header.isascii() and b"\n" in header and body.is_at_end())
+    polygons = _Polygons(vertices, numbers, sizes, header.isascii() and b"\n" in header and body.is_at_end())
+    if folder is None:
+        return polygons
+    named = re.search(r"(?m)^comment TextureFile[ \t]+(.*\S)", header.decode("latin-1").replace("\r", "\n"))
+    if named is None:
+        return replace(polygons, rgb=rgb)
+    if vertex_uv is not None and corner_uv is None and ((numbers >= 0) & (numbers < len(vertices))).all():
+        corner_uv = vertex_uv[numbers]
+    paints = (Paint(picture=read_picture(folder, named[1])),)
+    return replace(polygons, uv=corner_uv, paints=paints, paint_of=np.zeros_like(sizes), texture_file=named[1])
+
+
+def _ply_columns(element: _Element, table: _Table, names: Sequence[str]) -> Floats | None:
+    """(N, ...) the properties of these names, whole numbers as shares of their largest; None if one is lacking."""
+    columns = [element.column(name) for name in names]
+    if -1 in columns or any(element.properties[i].length_type for i in columns):
+        return None
+    return np.column_stack([table.values(i) / _FULL_SCALE.get(element.properties[i].type, 1.0) for i in columns])
 
 
 def _ply_header(data: bytes) -> tuple[bytes, str, list[_Element]]:
@@ -546,7 +627,7 @@ _STL_TRIANGLE = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), (
 _STL_HEADER_BYTES = 84
 
 
-def _read_stl(data: bytes) -> _Polygons:
+def _read_stl(data: bytes, _: Path | None) -> _Polygons:
     # The number of triangles, below 2^24, ends in a zero byte; texts have none. Both kinds may begin with "solid".
     if len(data) >= _STL_HEADER_BYTES and 0 in data[80:_STL_HEADER_BYTES]:
         vertices = _binary_stl(data)
@@ -603,12 +684,12 @@ def _stl_fault(text: bytes) -> _Fault:
 # OBJ and OFF
 
 
-def _read_obj(data: bytes) -> _Polygons:
+def _read_obj(data: bytes, folder: Path | None) -> _Polygons:
     vertices: list[list[float]] = []
     corners: list[int] = []
     sizes: list[int] = []
-    joined = re.sub(rb"\\[ \t]*\r?\n", b" ", data)
-    for number, line in enumerate(joined.splitlines(), start=1):
+    lines = re.sub(rb"\\[ \t]*\r?\n", b" ", data).splitlines()
+    for number, line in enumerate(lines, start=1):
         words = line.partition(b"#")[0].split()
         if not words:
             continue
@@ -619,7 +700,59 @@ def _read_obj(data: bytes) -> _Polygons:
             sizes.append(len(words) - 1)
         elif words[0] in {b"surf", b"curv2"}:
             raise _Fault(f"line {number} is a free-form surface; save it as polygons")
-    return _Polygons(_table(vertices), np.array(corners, dtype=np.int64), np.array(sizes, dtype=np.int64))
+    polygons = _Polygons(_table(vertices), np.array(corners, dtype=np.int64), np.array(sizes, dtype=np.int64))
+    return polygons if folder is None else _with_obj_paint(polygons, lines, folder)
+
+
+def _with_obj_paint(polygons: _Polygons, lines: Sequence[bytes], folder: Path) -> _Polygons:
+    """The polygons of an OBJ file with the colours of its vertices and what its materials look like."""
+    rgb: list[list[float]] = []
+    places: list[list[float]] = []
+    place_of: list[int] = []
+    libraries: list[str] = []
+    materials: list[str] = [""]
+    material_of: list[int] = []
+    for number, line in enumerate(lines, start=1):
+        words = line.partition(b"#")[0].split()
+        match words[:1]:
+            case [b"v"] if len(words) in (7, 8):  # perhaps with alpha; a single number more is a weight
+                rgb.append(_coordinates(words[4:7], f"line {number}"))
+            case [b"vt"]:
+                places.append(_coordinates([*words[1:3], b"0", b"0"][:3], f"line {number}")[:2])
+            case [b"f" | b"fo"]:
+                place_of += [_obj_place(word, len(places)) for word in words[1:]]
+                material_of.append(len(materials) - 1)
+            case [b"mtllib"]:
+                libraries.append(_rest(line))
+            case [b"usemtl"]:
+                materials.append(_rest(line))
+    if len(rgb) == len(polygons.vertices):
+        polygons = replace(polygons, rgb=_table(rgb))
+    if not libraries or len(materials) == 1:
+        return polygons
+    known = {name: paint for library in libraries for name, paint in read_mtl(folder, library).items()}
+    unknown = [name for name in materials if name and name not in known]
+    if unknown:
+        raise _Fault(f"uses the material {unknown[0]}, which {', '.join(libraries)} does not define")
+    numbers = np.array(place_of, dtype=np.int64)
+    if len(numbers) and not -1 <= numbers.min() <= numbers.max() < len(places):
+        raise _Fault(f"a face names the texture coordinates {numbers.max() + 1}; there are only {len(places)}")
+    uv = np.array([*places, [np.nan, np.nan]], dtype=np.float64)  # the last for corners without any
+    paints = [known.get(name, Paint()) for name in materials]
+    return replace(polygons, uv=uv[numbers], paints=paints, paint_of=np.array(material_of, dtype=np.int64))
+
+
+def _rest(line: bytes) -> str:
+    """What a line says after its first word."""
+    return line.partition(b"#")[0].strip().partition(b" ")[2].strip().decode("utf-8", "replace")
+
+
+def _obj_place(word: bytes, known: int) -> int:
+    """The texture coordinates of a corner `v/vt/vn`, counted from 0; -1 if it has none."""
+    text = word.split(b"/")[1] if b"/" in word else b""
+    if not re.fullmatch(rb"[+-]?\d{1,18}", text) or int(text) == 0:
+        return -1
+    return int(text) - 1 if int(text) > 0 else known + int(text)
 
 
 def _obj_corner(word: bytes, known: int, place: str) -> int:
@@ -630,7 +763,7 @@ def _obj_corner(word: bytes, known: int, place: str) -> int:
     return int(text) - 1 if int(text) > 0 else known + int(text)
 
 
-def _read_off(data: bytes) -> _Polygons:
+def _read_off(data: bytes, _: Path | None) -> _Polygons:
     lines = _off_lines(data)
     number, words = next(lines, (0, []))
     kind = re.fullmatch(rb"(ST)?(C)?(N)?(4)?(n)?OFF", words[0]) if words else None
@@ -677,6 +810,62 @@ def _first(
         yield line
 
 
+# GLB
+
+
+def _read_glb(data: bytes, folder: Path | None) -> _Polygons:
+    """Every mesh of the scene where it stands; vertices that only normals or textures keep apart are one."""
+    import trimesh
+
+    try:
+        scene = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False)
+        parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
+    except Exception as error:  # trimesh raises whatever its parts do
+        reason = " ".join(str(error).split())[:100] or type(error).__name__
+        raise _Fault(f"cannot be read as a GLB file ({reason})") from None
+    if not parts:
+        raise _Fault("holds no faces; a triangle mesh is needed")
+    vertices = np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts])
+    before = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    corners = np.concatenate(
+        [np.asarray(part.faces).ravel() + start for part, start in zip(parts, before, strict=False)]
+    )
+    polygons = _Polygons(vertices, corners.astype(np.int64), np.full(len(corners) // 3, 3))
+    if folder is not None:
+        polygons = _with_visuals(polygons, parts)
+    keys = vertices if polygons.rgb is None else np.column_stack([vertices, polygons.rgb])
+    _, first, same = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    rgb = None if polygons.rgb is None else polygons.rgb[first]
+    return replace(polygons, vertices=vertices[first], corners=same.ravel()[corners], rgb=rgb)
+
+
+def _with_visuals(polygons: _Polygons, parts: Sequence[Any]) -> _Polygons:
+    """The polygons with the materials, or the vertex colours, of the parts that they are from."""
+    need("PIL")  # without it, trimesh leaves textures out
+    visuals = [part.visual for part in parts]
+    paints, uv, rgb = [], [], []
+    for part, visual in zip(parts, visuals, strict=True):
+        material = getattr(visual, "material", None)
+        factor = getattr(material, "baseColorFactor", None)
+        picture = getattr(material, "baseColorTexture", None)
+        pixels = None if picture is None else np.asarray(picture.convert("RGB"), dtype=np.uint8)
+        paints.append(linear_factor((1, 1, 1) if factor is None else (np.asarray(factor) / 255).tolist(), pixels))
+        places = getattr(visual, "uv", None)
+        uv.append(np.full((len(part.vertices), 2), np.nan) if places is None else np.asarray(places, dtype=np.float64))
+        painted = visual.kind == "vertex"
+        rgb.append(visual.vertex_colors[:, :3] / 255 if painted else np.full((len(part.vertices), 3), np.nan))
+    painted = [visual.kind == "vertex" for visual in visuals]
+    if any(painted) and any(paint.picture is not None for paint in paints):
+        raise _Fault("has textures on some of its meshes and vertex colours on others; bake them into one texture")
+    if any(painted):
+        flat = [np.where(np.isnan(of), np.array(paint.rgb) / 255, of) for of, paint in zip(rgb, paints, strict=True)]
+        return replace(polygons, rgb=np.concatenate(flat))
+    if not any(getattr(visual, "material", None) is not None for visual in visuals):
+        return polygons
+    paint_of = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
+    return replace(polygons, uv=np.concatenate(uv)[polygons.corners], paints=paints, paint_of=paint_of)
+
+
 # Numbers in text
 
 
@@ -713,10 +902,11 @@ def _shown(text: bytes) -> str:
     return repr(text[:40].decode("latin-1"))
 
 
-_READERS: Mapping[str, Callable[[bytes], _Polygons]] = {
+_READERS: Mapping[str, Callable[[bytes, Path | None], _Polygons]] = {
     ".ply": _read_ply,
     ".stl": _read_stl,
     ".obj": _read_obj,
     ".off": _read_off,
+    ".glb": _read_glb,
 }
 SUFFIXES = tuple(_READERS)

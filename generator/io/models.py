@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from synthetless.errors import UserError
 from synthetless.io.documents import read_document, shown
 from synthetless.io.files import read_json
+from synthetless.io.images import encode_png
 from synthetless.io.meshes import SUFFIXES, TriangleMesh, read_mesh
+from synthetless.scenes.spec import SurfaceColours
 
 INFO_FILE = "models_info.json"
 NAMES_FILE = "names.yaml"
@@ -37,6 +39,7 @@ class ObjectModel:
         faces: (F, 3) int32.
         info: the object's entry in models_info.json: diameter, box and symmetries.
         is_verbatim: whether the file holds exactly these vertices and triangles.
+        colours: of its surface, if they were asked for and the file has any.
     """
 
     obj_id: int
@@ -45,6 +48,7 @@ class ObjectModel:
     faces: NDArray[np.int32]
     info: Mapping[str, Any]
     is_verbatim: bool = True
+    colours: SurfaceColours | None = None
 
     @property
     def diameter_mm(self) -> float:
@@ -65,7 +69,17 @@ class ObjectModel:
         """The PLY file that a dataset carries: the model's own where that is this mesh, else one written of it."""
         if self.is_verbatim:
             return self.path.read_bytes()
-        return TriangleMesh(self.vertices_mm, self.faces.astype(np.int64), self.is_verbatim).to_ply()
+        mesh = TriangleMesh(self.vertices_mm, self.faces.astype(np.int64), self.is_verbatim, self.colours)
+        return mesh.to_ply(texture_file(self.obj_id))
+
+    def to_png(self) -> bytes | None:
+        """The texture that a dataset carries beside the PLY file; None if there is none."""
+        return None if self.colours is None or self.colours.texture is None else encode_png(self.colours.texture)
+
+
+def texture_file(obj_id: int) -> str:
+    """The name of a model's texture, as BOP has it."""
+    return f"obj_{obj_id:06d}.png"
 
 
 def box_corners(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -92,7 +106,7 @@ class MeshFiles:
 
 
 def find_meshes(folder: Path) -> MeshFiles:
-    """The PLY, STL, OBJ and OFF files of any folder.
+    """The PLY, STL, OBJ, OFF and GLB files of any folder.
 
     Ids come from the names (`obj_000012.ply`, `12.stl`) if all of them say one, else from alphabetical order.
 
@@ -116,18 +130,19 @@ def find_meshes(folder: Path) -> MeshFiles:
     return MeshFiles(dict(sorted(paths.items())), are_numbered=False)
 
 
-def load_models(folder: Path, obj_ids: tuple[int, ...] | None = None) -> dict[int, ObjectModel]:
+def load_models(folder: Path, obj_ids: tuple[int, ...] | None = None, colours: bool = False) -> dict[int, ObjectModel]:
     """Read a BOP models folder.
 
     Args:
         folder: holds obj_%06d.ply and models_info.json.
         obj_ids: read only these; all of them if None.
+        colours: whether to read the colours of their surfaces, too.
 
     Returns:
         Models by id, in ascending order.
 
     Raises:
-        UserError: the folder, a mesh or models_info.json is missing or unusable.
+        UserError: the folder, a mesh, its texture or models_info.json is missing or unusable.
     """
     files = _find_meshes(folder)
     info = read_models_info(folder)
@@ -141,7 +156,7 @@ def load_models(folder: Path, obj_ids: tuple[int, ...] | None = None) -> dict[in
                 f"{folder / INFO_FILE}: no entry for object {obj_id} ({files[obj_id].name}); "
                 "add its diameter, box and symmetries, or leave it out with objects.ids"
             )
-    return {obj_id: _load_model(obj_id, files[obj_id], info[obj_id]) for obj_id in wanted}
+    return {obj_id: _load_model(obj_id, files[obj_id], info[obj_id], colours) for obj_id in wanted}
 
 
 def read_models_info(folder: Path) -> dict[int, dict[str, Any]]:
@@ -213,12 +228,13 @@ def _find_meshes(folder: Path) -> dict[int, Path]:
     return files
 
 
-def _load_model(obj_id: int, path: Path, info: Mapping[str, Any]) -> ObjectModel:
-    mesh = read_mesh(path)
+def _load_model(obj_id: int, path: Path, info: Mapping[str, Any], colours: bool) -> ObjectModel:
+    mesh = read_mesh(path, colours=colours)
     if _length_mm(path, obj_id, info, "diameter") == 0:
         raise UserError(f"{path.parent / INFO_FILE}: object {obj_id} has diameter 0; a positive number of mm is needed")
     _check_box(path, obj_id, mesh.vertices_mm, info)
-    return ObjectModel(obj_id, path, mesh.vertices_mm, mesh.faces.astype(np.int32), info, mesh.is_verbatim)
+    is_verbatim = mesh.is_verbatim and mesh.texture_file in (None, texture_file(obj_id))
+    return ObjectModel(obj_id, path, mesh.vertices_mm, mesh.faces.astype(np.int32), info, is_verbatim, mesh.colours)
 
 
 def _check_box(path: Path, obj_id: int, vertices_mm: NDArray[np.float64], info: Mapping[str, Any]) -> None:

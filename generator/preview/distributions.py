@@ -203,6 +203,13 @@ def _light(seen: Observations, recipe: Recipe) -> Iterator[Distribution]:
     yield _uniform("light_warmth", "light", "Warmth of the lamp", warmth, asked.warmth)
     ambient = np.array([spec.ambient.level for spec in seen.drops])
     yield _uniform("ambient", "light", "Ambient level", ambient, asked.ambient)
+    environments = [spec.environment for spec in seen.drops if spec.environment is not None]
+    if environments:
+        turn_deg = np.array([environment.turn_deg for environment in environments])
+        yield _uniform("environment_turn", "light", "Turn of the panorama, °", turn_deg, (0.0, 360.0))
+        strength = np.array([environment.strength for environment in environments])
+        bounds = asked.environment_strength
+        yield _uniform("environment_strength", "light", "Strength of the panorama", strength, bounds)
     if asked.room is not None:
         yield from _room([spec.room for spec in seen.drops if spec.room is not None], asked.room)
 

@@ -23,7 +23,7 @@ from synthetless.extras import cv2
 from synthetless.io import images
 from synthetless.io.files import atomic_write, read_bytes
 from synthetless.io.models import BOX_EDGES
-from synthetless.scenes.spec import Material, PlaneSpec, RoomSpec, SensorSpec, Vector, View
+from synthetless.scenes.spec import EnvironmentSpec, Material, PlaneSpec, RoomSpec, SensorSpec, Vector, View
 from synthetless.scenes.srgb import srgb_from_linear
 from synthetless.scenes.textures import PhotoTexture
 from synthetless.symmetry import SymmetryTable
@@ -283,6 +283,7 @@ def _sections(K: Floats, recorded: ImageSpec | None) -> list[Section]:
             ],
         },
         *([] if spec.room is None else [{"title": "Room", "rows": _room_rows(spec.room)}]),
+        *([] if spec.environment is None else [{"title": "Panorama", "rows": _environment_rows(spec.environment)}]),
         {"title": "Table", "rows": _plane_rows(spec.plane)},
         {
             "title": "Drop",
@@ -329,6 +330,14 @@ def _room_rows(room: RoomSpec) -> list[list[str]]:
     ]
 
 
+def _environment_rows(environment: EnvironmentSpec) -> list[list[str]]:
+    return [
+        ["panorama", environment.file],
+        ["turn", f"{environment.turn_deg:.1f}°"],
+        ["strength", f"{environment.strength:.2f}"],
+    ]
+
+
 def _sensor_rows(sensor: SensorSpec) -> list[list[str]]:
     return [
         ["point spread", f"{sensor.blur_px:.2f} px"],
@@ -350,7 +359,8 @@ def _material(recorded: ImageSpec | None, gt_id: int) -> list[str]:
         return []
     made_of: Material = recorded.scene.objects[recorded.instances[gt_id]].material
     colour = _hex(made_of.albedo)
-    words = f"{colour}, roughness {made_of.roughness:.2f}, specular {made_of.specular:.2f}"
+    shown = colour if made_of.colour == "grey" else "colours of the model"
+    words = f"{shown}, roughness {made_of.roughness:.2f}, specular {made_of.specular:.2f}"
     return [words + (f", metallic {made_of.metallic:.2f}" if made_of.metallic else ""), colour]
 
 

@@ -43,8 +43,8 @@ from synthetless.io.images import (
 )
 from synthetless.io.models import load_models
 from synthetless.scenes.camera import extrinsics, settled_centre
-from synthetless.scenes.sampling import sample_container, sample_room
-from synthetless.scenes.spec import ContainerSpec
+from synthetless.scenes.sampling import sample_container, sample_surroundings
+from synthetless.scenes.spec import ContainerSpec, SceneSpec
 from synthetless.symmetry import SymmetryTable
 from synthetless.validation.images import (
     EXACT,
@@ -92,8 +92,8 @@ def check_specs(source: Source, scene: SceneRecords, plans: Sequence[ImagePlan])
             yield Finding("spec", path, f"{shown}; this image is of drop {plan.drop}, view {plan.view}", im_id)
         if plan is not None and spec.sensor != planned_sensor(source.recipe, plan):
             yield Finding("spec", path, "records another sensor than the recipe draws for this image", im_id)
-        if spec.scene.room != sample_room(source.recipe.light.room, source.recipe.seed, spec.scene.drop):
-            yield Finding("spec", path, "records another room than the recipe draws for this drop", im_id)
+        if not _is_surrounded_as_drawn(source.recipe, spec.scene):
+            yield Finding("spec", path, "records other surroundings than the recipe draws for this drop", im_id)
         containers = source.recipe.release.container
         if spec.scene.container != sample_container(containers, source.recipe.seed, spec.scene.drop):
             yield Finding("spec", path, "records another container than the recipe draws for this drop", im_id)
@@ -102,6 +102,14 @@ def check_specs(source: Source, scene: SceneRecords, plans: Sequence[ImagePlan])
             yield Finding("spec", path, fault, im_id)
         elif im_id in scene.camera and im_id in scene.gt:
             yield from _check_poses(scene, spec)
+
+
+def _is_surrounded_as_drawn(recipe: Recipe, scene: SceneSpec) -> bool:
+    """Whether room and panorama are those of the plan; which panorama it is, the folder, which may be gone, decides."""
+    recorded = scene.room, scene.environment
+    file = scene.environment.file if scene.environment else ""
+    offered = () if recipe.light.environments is None else (file,)
+    return recorded == sample_surroundings(recipe.light, offered, recipe.seed, scene.drop)
 
 
 def incoherence(spec: ImageSpec) -> str | None:

@@ -26,7 +26,7 @@ from synthetless.dataset.layout import (
 )
 from synthetless.dataset.records import CameraFile, Count, ModelEntry, ModelInfo, camera_json, schema_faults
 from synthetless.io.files import read_bytes, read_json
-from synthetless.io.models import INFO_FILE, NAMES_FILE, ObjectModel, load_models, read_models_info
+from synthetless.io.models import INFO_FILE, NAMES_FILE, ObjectModel, load_models, read_models_info, texture_file
 from synthetless.scenes.spec import Role
 from synthetless.symmetry import SymmetryGroup, SymmetryTable
 from synthetless.validation.records import SceneRecords
@@ -63,6 +63,7 @@ class Header(BaseModel):
     recipe: Recipe
     versions: dict[str, str]
     models_sha256: dict[int, str]
+    textures_sha256: dict[int, str] = {}
     scenery_digest: str
     licence: str
     counts: Counts
@@ -146,7 +147,7 @@ def read_source(root: Path, header: Header) -> tuple[Source, list[Finding]]:
     folder = root / MODELS_FOLDER
     infos, obj_ids, faults = read_infos(folder / INFO_FILE, declared=True)
     findings += faults
-    models = _read_models(folder, infos, header.models_sha256, findings)
+    models = _read_models(folder, infos, header.models_sha256, header.textures_sha256, findings)
     for obj_id in sorted(obj_ids ^ header.models_sha256.keys()) if obj_ids else ():
         there = "an entry" if obj_id in obj_ids else "no entry"
         message = f"has {there} for object {obj_id}; {DATASET_FILE} says otherwise"
@@ -232,7 +233,11 @@ def _check_declared(path: Path, obj_id: int, info: ModelInfo) -> list[Finding]:
 
 
 def _read_models(
-    folder: Path, infos: Mapping[int, ModelInfo], digests: Mapping[int, str], findings: list[Finding]
+    folder: Path,
+    infos: Mapping[int, ModelInfo],
+    digests: Mapping[int, str],
+    textures: Mapping[int, str],
+    findings: list[Finding],
 ) -> dict[int, ObjectModel]:
     """The models that the dataset was made of.
 
@@ -240,11 +245,19 @@ def _read_models(
         folder: to read and check.
         infos: the good entries of its models_info.json.
         digests: SHA-256 of the PLY files that the dataset was made of.
+        textures: SHA-256 of their textures.
         findings: gets what is wrong.
     """
     path = folder / INFO_FILE
     models: dict[int, ObjectModel] = {}
     known = {path, folder / NAMES_FILE}
+    for obj_id, digest in sorted(textures.items()):
+        texture = folder / texture_file(obj_id)
+        known.add(texture)
+        if not texture.exists():
+            findings.append(Finding("missing", texture, "not there; dataset.json names it"))
+        elif hashlib.sha256(read_bytes(texture)).hexdigest() != digest:
+            findings.append(Finding("models", texture, "is not the texture that the dataset was made of"))
     for obj_id, digest in sorted(digests.items()):
         mesh = folder / f"obj_{obj_id:06d}.ply"
         known.add(mesh)

@@ -1,26 +1,34 @@
-"""The room around the table against closed forms: how bright it makes things, and what a mirror sees of it."""
+"""What stands around the table against closed forms: how bright it makes things, and what a mirror sees of it."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
 from agreement import cycles_geometry
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from synthetless.annotation.raycast import Plane, RayCaster
 from synthetless.annotation.scene import PosedModel
 from synthetless.config import RecipeError, load_recipe
-from synthetless.generation.sources import load_sources
+from synthetless.errors import UserError
+from synthetless.generation.progress import Tracker, silent
+from synthetless.generation.sources import check_pictures, load_sources
+from synthetless.io.images import encode_exr
+from synthetless.scenes.environments import sky_brightness
 from synthetless.scenes.render import BlenderSession
 from synthetless.scenes.sampling import Catalogue, ceiling_share, sample_scene
 from synthetless.scenes.settings import RenderSettings, TableSettings
 from synthetless.scenes.spec import (
     AmbientLight,
     AreaLight,
+    EnvironmentSpec,
     Intrinsics,
     Material,
     Mesh,
@@ -31,6 +39,8 @@ from synthetless.scenes.spec import (
     Vector,
     View,
 )
+from synthetless.scenes.spec import plain as plain_spec
+from synthetless.scenes.srgb import LUMINANCE_WEIGHTS
 
 pytestmark = pytest.mark.blender
 
@@ -57,7 +67,9 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> BlenderSession:
     return BlenderSession(meshes, CAMERA, settings, TableSettings(size_m=0.5), log=log)
 
 
-def scene_of(obj_id: int, material: Material, room: RoomSpec, ambient: float = 0.0) -> tuple[SceneSpec, list[Pose]]:
+def scene_of(
+    obj_id: int, material: Material, room: RoomSpec | None, ambient: float = 0.0
+) -> tuple[SceneSpec, list[Pose]]:
     """One object half a metre above the table, without the lamp."""
     spec = sample_scene(load_recipe(None, ["objects.count=[1, 1]"]), Catalogue({obj_id: 0.06}, {}), 11, 0)
     spec = dataclasses.replace(
@@ -117,8 +129,8 @@ ROOM = RoomSpec(
 )
 
 
-def seen_in_ball(spec: SceneSpec, R_w2c: Floats, t_w2c: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """(H, W, 3) colours of the room that a perfect mirror ball shows, and (H, W) where it shows ceiling or walls."""
+def mirrored_rays(R_w2c: Floats, t_w2c: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """(H, W, 3) points of the ball, metres, the directions in which it mirrors there, and (H, W) where it is seen."""
     rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
     rays = np.stack([(columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy, np.ones_like(rows)], axis=-1)
     rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ R_w2c
@@ -129,9 +141,13 @@ def seen_in_ball(spec: SceneSpec, R_w2c: Floats, t_w2c: Floats) -> tuple[Floats,
     hit = inside > 0
     points = eye + (along - np.sqrt(np.maximum(inside, 0)))[..., None] * rays
     normals = (points - CENTRE_M) / RADIUS_M
-    mirrored = rays - 2 * (rays * normals).sum(axis=-1, keepdims=True) * normals
-    assert spec.room is not None
-    half, height = spec.room.side_m / 2, spec.room.height_m
+    return points, rays - 2 * (rays * normals).sum(axis=-1, keepdims=True) * normals, hit
+
+
+def room_in_ball(room: RoomSpec, R_w2c: Floats, t_w2c: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """(H, W, 3) colours of the room that a perfect mirror ball shows, and (H, W) where it shows ceiling or walls."""
+    points, mirrored, hit = mirrored_rays(R_w2c, t_w2c)
+    half, height = room.side_m / 2, room.height_m
     with np.errstate(divide="ignore"):
         ways = np.stack(
             [(sign * half - points[..., axis]) / mirrored[..., axis] for sign in (1, -1) for axis in (0, 1)]
@@ -139,7 +155,7 @@ def seen_in_ball(spec: SceneSpec, R_w2c: Floats, t_w2c: Floats) -> tuple[Floats,
             axis=-1,
         )
     nearest = np.where(ways > 0, ways, np.inf).argmin(axis=-1)
-    colours = np.array([*spec.room.walls, spec.room.ceiling])
+    colours = np.array([*room.walls, room.ceiling])
     return colours[nearest], hit & (mirrored[..., 2] > 0.02)
 
 
@@ -147,7 +163,7 @@ def test_a_mirror_ball_sees_the_room(session: BlenderSession) -> None:
     spec, settled = scene_of(BALL, MIRROR, ROOM)
     with session.scene(spec, settled) as scene:
         seen = scene.render(0)
-        expected, shown = seen_in_ball(spec, *scene.extrinsics(0))
+        expected, shown = room_in_ball(ROOM, *scene.extrinsics(0))
     sure = shown.copy()  # neighbours that show the same side of the room
     for axis in (0, 1):
         for step in (1, -1):
@@ -159,8 +175,67 @@ def test_a_mirror_ball_sees_the_room(session: BlenderSession) -> None:
     assert np.percentile(errors, 95) < 0.02
 
 
-def test_a_room_hides_and_moves_nothing(session: BlenderSession, tmp_path: Path) -> None:
-    spec, settled = scene_of(BALL, MIRROR, ROOM)
+def shining(directions: Floats, turn_deg: float) -> NDArray[np.float32]:
+    """Light that differs from everywhere, turned about the vertical; (..., 3) for unit vectors (..., 3)."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    cos, sin = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    levels = np.stack([cos * x + sin * y, cos * y - sin * x, z], axis=-1)
+    return (0.5 + 0.4 * levels).astype(np.float32)
+
+
+def panorama(height: int = 256) -> NDArray[np.float32]:
+    """It, as seen from its middle: the azimuth 0 in the middle column, greater ones to the left."""
+    elevation = np.pi / 2 - np.pi * (np.arange(height) + 0.5)[:, None] / height
+    azimuth = np.pi - np.pi * (np.arange(2 * height) + 0.5)[None] / height
+    parts = (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation) + 0 * azimuth)
+    return shining(np.stack(parts, axis=-1), 0.0)
+
+
+def write_hdr(path: Path, light: NDArray[np.float32]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    encoded = cv2.imencode(".hdr", light[..., ::-1])[1]
+    path.write_bytes(encoded.tobytes())
+
+
+@pytest.mark.parametrize("suffix", [".hdr", ".exr"])
+def test_a_mirror_ball_sees_the_panorama(session: BlenderSession, tmp_path: Path, suffix: str) -> None:
+    light = panorama()
+    if suffix == ".hdr":
+        write_hdr(tmp_path / "sky.hdr", light)
+    else:
+        (tmp_path / "sky.exr").write_bytes(encode_exr(light))
+    spec, settled = scene_of(BALL, MIRROR, None, ambient=0.1)
+    spec = dataclasses.replace(spec, environment=EnvironmentSpec(f"sky{suffix}", 130.0, 2.0))
+    session.panoramas = tmp_path
+    with session.scene(spec, settled) as scene:
+        seen = scene.render(0)
+        _, mirrored, hit = mirrored_rays(*scene.extrinsics(0))
+    expected = 0.1 + 2.0 / sky_brightness(light) * shining(mirrored, 130.0)
+    shown = cv2.erode((hit & (mirrored[..., 2] > 0.02)).astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    assert shown.sum() > 300
+    assert np.percentile(np.abs(seen - expected)[shown].max(axis=-1), 95) < 0.03
+
+
+def test_a_panorama_is_as_bright_as_the_recipe_says(session: BlenderSession, tmp_path: Path) -> None:
+    light = panorama()
+    assert sky_brightness(light) == pytest.approx(0.5 + 0.4 * 0.0722 * 2 / 3, abs=1e-4)  # of the blue, z grows by 2/3
+    assert sky_brightness(np.ones((64, 128, 3), dtype=np.float32)) == pytest.approx(1.0, abs=1e-6)
+    write_hdr(tmp_path / "sky.hdr", 7 * light)
+    spec, settled = scene_of(CARD, WHITE, None)
+    spec = dataclasses.replace(spec, environment=EnvironmentSpec("sky.hdr", 10.0, 0.6))
+    session.panoramas = tmp_path
+    with session.scene(spec, settled) as scene:
+        card = scene.render(0)[30:50, 38:58].mean(axis=(0, 1))
+    assert card @ LUMINANCE_WEIGHTS == pytest.approx(0.6, rel=0.02)
+
+
+@pytest.mark.parametrize("around", ["room", "panorama"])
+def test_surroundings_hide_and_move_nothing(session: BlenderSession, tmp_path: Path, around: str) -> None:
+    write_hdr(tmp_path / "sky.hdr", panorama(64))
+    environment = EnvironmentSpec("sky.hdr", 10.0, 0.6) if around == "panorama" else None
+    spec, settled = scene_of(BALL, MIRROR, ROOM if around == "room" else None)
+    spec = dataclasses.replace(spec, environment=environment)
+    session.panoramas = tmp_path
     with session.scene(spec, settled) as scene:
         rendered = cycles_geometry(scene, 0, tmp_path)
         R, t = scene.extrinsics(0)
@@ -187,8 +262,61 @@ def test_a_room_is_drawn_from_a_stream_of_its_own() -> None:
 
 
 @pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("empty", "cannot be decoded as a Radiance file"),
+        ("cut", "cannot be decoded as a Radiance file"),
+        ("png", "holds an ordinary picture of 8 bits"),
+        ("png.exr", "cannot be decoded as an OpenEXR file"),
+        ("square", "has 32 x 32 pixels; one that is twice as wide as high"),
+        ("nan.exr", "negative or no finite numbers"),
+        ("black", "is black above the horizon"),
+        ("depth.exr", "R, G and B are needed"),
+        ("none", "no .hdr or .exr file"),
+        ("missing", "not a folder"),
+    ],
+)
+def test_a_panorama_that_is_none_is_told_in_one_line(tmp_path: Path, name: str, told: str) -> None:
+    import OpenEXR
+
+    folder, light = tmp_path / "panoramas", panorama(32)
+    if name != "missing":
+        write_hdr(folder / "a.hdr", light)
+    target = folder / (name if "." in name else f"{name}.hdr")
+    whole = (folder / "a.hdr").read_bytes() if name != "missing" else b""
+    _, png = cv2.imencode(".png", np.full((32, 64, 3), 90, dtype=np.uint8))
+    if name == "none":
+        (folder / "a.hdr").rename(folder / "a.txt")
+    elif name in ("nan.exr", "depth.exr"):
+        light[3, 3] = np.nan
+        content = {"RGB": light} if name == "nan.exr" else {"Z": light[..., 0].copy()}
+        OpenEXR.File({"type": OpenEXR.scanlineimage}, content).write(str(target))
+    elif name in ("square", "black"):
+        write_hdr(target, light[:, :32] if name == "square" else 0 * light)
+    elif name != "missing":
+        target.write_bytes({"empty": b"", "cut": whole[:-1]}.get(name, png.tobytes()))
+    with pytest.raises(UserError, match=r"^[^\n]*$") as error:
+        sources = load_sources(load_recipe(None, [f"light.environments={json.dumps(str(folder))}"]))
+        check_pictures(sources, Tracker(silent))
+    assert told in str(error.value)
+
+
+def test_panoramas_and_rooms_share_the_drops() -> None:
+    recipe = load_recipe(None, ["light.environment_share=0.5", "light.room=ranges", "light.environments=any"])
+    catalogue = Catalogue({1: 0.05}, {}, panoramas=("a.hdr", "b.exr"))
+    scenes = [sample_scene(recipe, catalogue, 3, drop) for drop in range(60)]
+    files = [scene.environment.file for scene in scenes if scene.environment]
+    assert 15 < len(files) < 45 and {"a.hdr", "b.exr"} == set(files)
+    assert all((scene.room is None) == (scene.environment is not None) for scene in scenes)
+    assert all(scene == TypeAdapter(SceneSpec).validate_json(json.dumps(plain_spec(scene))) for scene in scenes), (
+        "survives being recorded"
+    )
+
+
+@pytest.mark.parametrize(
     ("override", "told"),
     [
+        ("light.environment_strength=[2, 1]", "min 2.0 is greater than max 1.0"),
         ("light.room=hall", "light.room"),
         ("light.room.walls=[0.4, 0.1]", "min 0.4 is greater than max 0.1"),
         ("light.room.side_m=[2, 3]", "the table, 6 m wide"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,10 @@ from synthetless.dataset.layout import ScenePaths
 from synthetless.dataset.records import read_scene_json, write_scene_json
 from synthetless.dataset.relabel import relabel
 from synthetless.io.files import locked
-from synthetless.io.images import encode_normals, encode_object_coordinates
+from synthetless.io.images import encode_normals, encode_object_coordinates, encode_png
+from synthetless.io.meshes import read_mesh
+from synthetless.io.models import load_models
+from synthetless.scenes.spec import SurfaceColours
 from synthetless.symmetry import SymmetryTable
 from synthetless.validation import Report, validate
 from synthetless.validation.run import SceneResult, SceneTask, check_scene
@@ -33,6 +37,7 @@ MAKES = {
     "a small table, fine depth": ("table.size_m=0.5", "encoding.depth_scale=0.01"),
     "much beyond the depth's range": ("encoding.depth_scale=0.0065",),
     "objects in boxes": ("release.container=box", "release.container.box.height_m=[0.03, 0.2]", EVERYTHING),
+    "a lit room": ("light.room=ranges", "objects.metallic=[0, 0.5]", "objects.grey_scale=linear"),
     "a low camera": ("camera.elevation_deg=[3, 8]",),
     "other labels": ("labels.scheme=atlas",),
 }
@@ -89,6 +94,38 @@ def test_a_box_hides_and_is_checked(valid: Path, tmp_path: Path, parts: Path) ->
     assert {("spec", "scene_spec.jsonl"), ("depth", "000001.png")} <= found("height_m", 0.05)
     assert found("rotation_deg", 1e300) >= {("spec", "scene_spec.jsonl")}
     assert found("wall_m", -1.0) == {("spec", "scene_spec.jsonl")}, "nothing to cast at"
+
+
+def test_surroundings_are_checked(tmp_path: Path, parts: Path) -> None:
+    root = tmp_path / "d"
+    valid_dataset.write_dataset(root, parts, ("light.room=ranges",))
+    assert not validate(root, workers=1).findings
+    for key, value in (("walls", [[9.0, 9.0, 9.0]] * 4), ("lamps", [])):
+        with Victim(root).specs() as lines:
+            kept, lines[IMAGE]["scene"]["room"][key] = lines[IMAGE]["scene"]["room"][key], value
+        found = {(f.kind, f.file.name) for f in validate(root, workers=1).findings if f.image == IMAGE}
+        assert ("spec", "scene_spec.jsonl") in found
+        with Victim(root).specs() as lines:
+            lines[IMAGE]["scene"]["room"][key] = kept
+
+
+def test_textures_are_carried_along_and_checked(tmp_path: Path, parts: Path) -> None:
+    models, root = tmp_path / "models", tmp_path / "d"
+    shutil.copytree(parts, models)
+    mesh = read_mesh(models / "obj_000001.ply")
+    uv = np.zeros((len(mesh.faces), 3, 2), dtype=np.float32)
+    picture = encode_png(np.full((8, 8, 3), 90, dtype=np.uint8))
+    colours = SurfaceColours(texture=np.full((8, 8, 3), 90, dtype=np.uint8), corner_uv=uv)
+    (models / "obj_000001.ply").write_bytes(replace(mesh, colours=colours).to_ply("skin.png"))
+    (models / "skin.png").write_bytes(picture)
+    valid_dataset.write_dataset(root, models, ("objects.colour=mixed",))
+    assert not validate(root, workers=1).findings
+    assert load_models(root / "models", (1,), colours=True)[1].colours is not None
+    texture = root / "models" / "obj_000001.png"
+    texture.write_bytes(encode_png(np.full((8, 8, 3), 91, dtype=np.uint8)))
+    assert [(f.kind, f.file.name) for f in validate(root, workers=1).findings] == [("models", texture.name)]
+    texture.unlink()
+    assert [(f.kind, f.file.name) for f in validate(root, workers=1).findings] == [("missing", texture.name)]
 
 
 def test_rays_that_cannot_be_cast_are_noted(cluttered: tuple[Path, Path]) -> None:

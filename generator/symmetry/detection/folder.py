@@ -15,6 +15,7 @@ from typing_extensions import Self
 from synthetless.errors import UserError
 from synthetless.io.documents import read_document, shown
 from synthetless.io.files import atomic_write, write_json
+from synthetless.io.images import encode_png
 from synthetless.io.meshes import TriangleMesh, read_mesh
 from synthetless.io.models import (
     INFO_FILE,
@@ -24,6 +25,7 @@ from synthetless.io.models import (
     object_names,
     read_models_info,
     read_names,
+    texture_file,
 )
 from synthetless.io.parallel import each
 from synthetless.symmetry.atlas import SCHEMES, Scheme
@@ -201,7 +203,7 @@ class DetectedFolder:
             "objects": [_object_json(o) for o in self.objects],
         }
 
-    def write_models(self, to: Path, recentred: bool = False) -> None:
+    def write_models(self, to: Path, recentred: bool = False, colours: bool = False) -> None:
         """Make a BOP models folder: `obj_%06d.ply`, in millimetres, and `models_info.json` with the detected groups.
 
         A PLY file that is already there under its name stays as it is.
@@ -210,9 +212,10 @@ class DetectedFolder:
             to: the folder.
             recentred: move each model so that its main axis is z and its fixed point the origin; `recentred.json`
                 says how.
+            colours: whether to carry along colours and textures of the meshes.
 
         Raises:
-            UserError: a file cannot be written, or the folder holds other meshes.
+            UserError: a texture is missing or unusable, a file cannot be written, or the folder holds other meshes.
         """
         targets = {to / f"obj_{o.obj_id:06d}.ply": o for o in self.objects}
         for target, o in targets.items():
@@ -221,22 +224,28 @@ class DetectedFolder:
                 raise UserError(f"{target}: would stand beside other meshes; give a new folder")
         infos: dict[str, Any] = {}
         for target, o in targets.items():
-            moved = self._recentred(o) if recentred and not o.recentring.is_none else None
+            moved = self._recentred(o, colours) if recentred and not o.recentring.is_none else None
             if not target.exists():
-                atomic_write(target, self._ply(o) if moved is None else moved.to_ply())
+                for name, content in self._files(o, moved or read_mesh(o.path, self.scale, colours)).items():
+                    atomic_write(to / name, content)
             group = o.recentred_entry.group if recentred else o.detected.answer.group
             infos[str(o.obj_id)] = _models_info(o, o.info if moved is None else moved.bop_info(), group)
         write_json(to / INFO_FILE, infos)
         if recentred:
             write_recentrings(to, {o.obj_id: o.recentring for o in self.objects})
 
-    def _ply(self, o: DetectedObject) -> bytes:
-        mesh = read_mesh(o.path, self.scale)
-        return o.path.read_bytes() if mesh.is_verbatim else mesh.to_ply()
+    def _files(self, o: DetectedObject, mesh: TriangleMesh) -> dict[str, bytes]:
+        """The PLY file of an object's mesh, and its texture, by their names."""
+        texture = texture_file(o.obj_id)
+        is_verbatim = mesh.is_verbatim and mesh.texture_file in (None, texture)
+        files = {f"obj_{o.obj_id:06d}.ply": o.path.read_bytes() if is_verbatim else mesh.to_ply(texture)}
+        if mesh.colours is not None and mesh.colours.texture is not None:
+            files[texture] = encode_png(mesh.colours.texture)
+        return files
 
-    def _recentred(self, o: DetectedObject) -> TriangleMesh:
-        mesh = read_mesh(o.path, self.scale)
-        return TriangleMesh(o.recentring.points(mesh.vertices_mm), mesh.faces, is_verbatim=False)
+    def _recentred(self, o: DetectedObject, colours: bool) -> TriangleMesh:
+        mesh = read_mesh(o.path, self.scale, colours)
+        return replace(mesh, vertices_mm=o.recentring.points(mesh.vertices_mm), is_verbatim=False)
 
 
 def detect_folder(
@@ -252,7 +261,7 @@ def detect_folder(
     Groups that a `models_info.json` in it declares are measured as well.
 
     Args:
-        folder: holds PLY, STL, OBJ or OFF files.
+        folder: holds PLY, STL, OBJ, OFF or GLB files.
         tolerance_percent: what the largest residual may be, as a share of the diameter.
         scale: what the files' coordinates are to be multiplied by to give millimetres.
         workers: processes; one per available core if None.
