@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -104,5 +105,7 @@ def test_a_wheel_works_beside_folders_of_the_same_names(wheel: Path, tmp_path: P
     assert all(Path(place).is_relative_to(site) for place in places.splitlines())
     assert len(places.splitlines()) == 2
     assert run("-m", "synthetless", "--version") == (f"synthetless {version('synthetless')}\n", "")
+    recipes, _ = run("-m", "synthetless", "recipes", "--json")
+    assert "demo" in json.loads(recipes)
     _, error = run("-m", "synthetless", "generate", "recipe.yaml", "--out", "out")
     assert "did you mean images?" in error
