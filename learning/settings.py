@@ -61,7 +61,7 @@ class DataSettings(Settings):
     sensor: Literal["none", "ranges", "primesense"] = "none"
     """Take every image anew with such a camera, from its linear light; the dataset needs the output exr."""
     workers: Annotated[int, Bounds(0, 256)] = 0
-    """Processes that read images; 0: the training's own."""
+    """Processes that read images, at most as many as cores; 0: the training's own."""
 
 
 class ScheduleSettings(Settings):

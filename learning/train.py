@@ -20,6 +20,7 @@ from synthetless.dataset.reader import Dataset
 from synthetless.errors import UserError
 from synthetless.io.files import read_json, write_json
 from synthetless.io.models import load_models
+from synthetless.io.parallel import usable_cores
 from synthetless.learning.data import FolderImages, Photographs, SampleBatcher, picture
 from synthetless.learning.detector import Detector, Instances
 from synthetless.learning.fit import CHECKPOINT_FILE, LOG_FILE, NO_LOSSES, Record, Schedule, fit, load, read_log
@@ -254,7 +255,7 @@ def train(
         loader = DataLoader(
             learned,
             batch_sampler=_Steps(len(images), training, rank, first),
-            num_workers=training.data.workers,
+            num_workers=min(training.data.workers, usable_cores()),  # of more torch says that they may freeze
             collate_fn=_stacked,
         )
         batches = iter(loader)
