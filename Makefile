@@ -13,7 +13,7 @@ setup: $(VENV)/.installed  ## make .venv with the synthetless command in it
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[blender,preview,ray,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[blender,preview,ray,cad,dev]'
 	@touch $@
 
 system-libraries:  ## install the shared libraries Blender needs (Debian and Ubuntu, as root)

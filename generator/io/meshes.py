@@ -1,4 +1,4 @@
-"""Mesh files: PLY, STL, OBJ, OFF and GLB, read as triangles; the only mesh reader of the project.
+"""Mesh files: PLY, STL, OBJ, OFF and GLB, and CAD files, read as triangles; the only mesh reader of the project.
 
 Libraries were tried first. trimesh (5.2) cuts concave polygons into overlapping triangles and refuses polygons of
 several sizes in one PLY file, spare bytes and Latin-1 comments; meshio (5.3) fails on these, too, and on a list called
@@ -16,7 +16,7 @@ import struct
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from synthetless.errors import UserError
 from synthetless.extras import need
+from synthetless.io.cad import CAD_SUFFIXES, TESSELLATION_MM, read_cad
 from synthetless.io.paint import Paint, PaintFault, linear_factor, one_texture, read_mtl, read_picture
 from synthetless.scenes.spec import SurfaceColours
 
@@ -131,17 +132,21 @@ def _principal_extents(points: Floats) -> Floats:
     return np.pad(extents, (0, 3 - len(extents)))  # fewer than three points span as few directions
 
 
-def read_mesh(path: Path, scale: float = 1.0, colours: bool = False) -> TriangleMesh:
-    """Read a PLY, STL, OBJ, OFF or GLB file, told by the end of its name.
+def read_mesh(
+    path: Path, scale: float = 1.0, colours: bool = False, tessellation_mm: float = TESSELLATION_MM
+) -> TriangleMesh:
+    """Read a PLY, STL, OBJ, OFF, GLB, STEP or IGES file, told by the end of its name.
 
     Polygons may be concave and a little warped, and of any number of corners; they are cut into triangles that cover
     them exactly. Vertices that no face uses are dropped.
 
     Args:
         path: of the file.
-        scale: what its coordinates are multiplied by to give millimetres.
+        scale: what its coordinates are multiplied by to give millimetres; those of CAD files, which state their unit,
+            are millimetres before.
         colours: whether to read the colours of its surface, too: those of vertices (PLY, OBJ, GLB), or its materials'
             colours and textures (OBJ, GLB; one texture of PLY files, as BOP has it).
+        tessellation_mm: how far the triangles of a CAD file may be from its surface.
 
     Raises:
         UserError: it cannot be read, is damaged, has no faces, a coordinate that is not finite, or a polygon that
@@ -149,6 +154,8 @@ def read_mesh(path: Path, scale: float = 1.0, colours: bool = False) -> Triangle
             names the file, what is wrong with it, and the line or the face.
     """
     reader = _READERS.get(path.suffix.lower())
+    if reader is None and path.suffix.lower() in CAD_SUFFIXES:
+        reader = partial(_read_cad, path.suffix, tessellation_mm)
     if reader is None:
         raise UserError(f"{path}: not a mesh file; one that ends in {', '.join(SUFFIXES)} is needed")
     try:
@@ -162,6 +169,14 @@ def read_mesh(path: Path, scale: float = 1.0, colours: bool = False) -> Triangle
             return _mesh_of(reader(data, path.parent if colours else None), scale)
     except (_Fault, PaintFault) as fault:
         raise UserError(f"{path}: {fault}") from None
+
+
+def _read_cad(suffix: str, tolerance_mm: float, data: bytes, _: Path | None) -> _Polygons:
+    try:
+        vertices, faces = read_cad(data, suffix, tolerance_mm)
+    except UserError as error:
+        raise _Fault(str(error)) from None
+    return _Polygons(vertices, faces.ravel(), np.full(len(faces), 3))
 
 
 class _Fault(Exception):
@@ -909,4 +924,4 @@ _READERS: Mapping[str, Callable[[bytes, Path | None], _Polygons]] = {
     ".off": _read_off,
     ".glb": _read_glb,
 }
-SUFFIXES = tuple(_READERS)
+SUFFIXES = (*_READERS, *CAD_SUFFIXES)

@@ -226,7 +226,7 @@ REFUSED: dict[str, tuple[bytes, str]] = {
     "vertices_cut.off": (off(BOX)[:60], "three coordinates are needed, not 1"),
     "bomb.off": (b"OFF\n999999999999999999 1 0\n0 0 0\n", "cut off after 1 of 999999999999999999 vertices"),
     "short_face.off": (off(BOX).replace(b"4 3 2 1 0", b"4 3 2 1"), "line 13: a number of corners"),
-    "part.step": (b"ISO-10303-21;", "not a mesh file; one that ends in .ply"),
+    "part.3mf": (b"ISO-10303-21;", "not a mesh file; one that ends in .ply"),
 }
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from typing_extensions import Self
 
 from synthetless.errors import UserError
+from synthetless.io.cad import TESSELLATION_MM
 from synthetless.io.documents import read_document, shown
 from synthetless.io.files import atomic_write, write_json
 from synthetless.io.images import encode_png
@@ -163,6 +164,7 @@ class DetectedFolder:
         tolerance_percent: what the largest residual may be, as a share of the diameter.
         scale: what the files' coordinates were multiplied by to get millimetres.
         tolerances: of objects that have another one.
+        tessellation_mm: how far triangles may be from the surfaces of CAD files.
     """
 
     folder: Path
@@ -171,6 +173,7 @@ class DetectedFolder:
     tolerance_percent: float
     scale: float
     tolerances: Mapping[int, Tolerance] = field(default_factory=dict)
+    tessellation_mm: float = TESSELLATION_MM
 
     @property
     def unit_warning(self) -> str | None:
@@ -226,7 +229,7 @@ class DetectedFolder:
         for target, o in targets.items():
             moved = self._recentred(o, colours) if recentred and not o.recentring.is_none else None
             if not target.exists():
-                for name, content in self._files(o, moved or read_mesh(o.path, self.scale, colours)).items():
+                for name, content in self._files(o, moved or self._read(o, colours)).items():
                     atomic_write(to / name, content)
             group = o.recentred_entry.group if recentred else o.detected.answer.group
             infos[str(o.obj_id)] = _models_info(o, o.info if moved is None else moved.bop_info(), group)
@@ -243,8 +246,11 @@ class DetectedFolder:
             files[texture] = encode_png(mesh.colours.texture)
         return files
 
+    def _read(self, o: DetectedObject, colours: bool) -> TriangleMesh:
+        return read_mesh(o.path, self.scale, colours, self.tessellation_mm)
+
     def _recentred(self, o: DetectedObject, colours: bool) -> TriangleMesh:
-        mesh = read_mesh(o.path, self.scale, colours)
+        mesh = self._read(o, colours)
         return replace(mesh, vertices_mm=o.recentring.points(mesh.vertices_mm), is_verbatim=False)
 
 
@@ -255,24 +261,30 @@ def detect_folder(
     workers: int | None = None,
     tolerances: Mapping[int, Tolerance] | None = None,
     quasi: Tolerance | None = None,
+    tessellation_mm: float = TESSELLATION_MM,
 ) -> DetectedFolder:
     """Detect the symmetry group of every mesh in a folder.
 
     Groups that a `models_info.json` in it declares are measured as well.
 
     Args:
-        folder: holds PLY, STL, OBJ, OFF or GLB files.
+        folder: holds PLY, STL, OBJ, OFF, GLB, STEP or IGES files.
         tolerance_percent: what the largest residual may be, as a share of the diameter.
         scale: what the files' coordinates are to be multiplied by to give millimetres.
         workers: processes; one per available core if None.
         tolerances: of objects that have another one.
         quasi: what the largest residual of a larger group may be that an object has but for a detail; None for none.
+        tessellation_mm: how far triangles may be from the surfaces of STEP and IGES files.
 
     Raises:
         UserError: wrong numbers, a tolerance of an object that is not there, a folder without meshes, a mesh that is
             unusable; with the file's name.
     """
-    for name, value in (("tolerance_percent", tolerance_percent), ("scale", scale)):
+    for name, value in (
+        ("tolerance_percent", tolerance_percent),
+        ("scale", scale),
+        ("tessellation_mm", tessellation_mm),
+    ):
         if not (np.isfinite(value) and value > 0):
             raise UserError(f"{name} is {value}; a number above 0 is needed")
     files = find_meshes(folder)
@@ -281,13 +293,21 @@ def detect_folder(
         known = ", ".join(map(str, files.paths))
         raise UserError(f"object {strangers[0]} has a tolerance, but {folder} holds objects {known}")
     tasks = [
-        _Task(obj_id, path, others.get(obj_id, Tolerance(tolerance_percent)), scale, declared.get(obj_id), quasi)
+        _Task(
+            obj_id,
+            path,
+            others.get(obj_id, Tolerance(tolerance_percent)),
+            scale,
+            declared.get(obj_id),
+            quasi,
+            tessellation_mm,
+        )
         for obj_id, path in files.paths.items()
     ]
     tasks.sort(key=lambda task: -task.path.stat().st_size)  # the longest first, so that no core ends up alone
     found = sorted(each(_detect_file, tasks, workers, "symmetries", "mesh"), key=lambda o: o.obj_id)
     objects = tuple(replace(o, name=names.get(o.obj_id)) for o in found)
-    return DetectedFolder(folder, objects, files.are_numbered, tolerance_percent, scale, others)
+    return DetectedFolder(folder, objects, files.are_numbered, tolerance_percent, scale, others, tessellation_mm)
 
 
 @dataclass(frozen=True)
@@ -298,10 +318,11 @@ class _Task:
     scale: float
     declared: SymmetryGroup | None
     quasi: Tolerance | None
+    tessellation_mm: float
 
 
 def _detect_file(task: _Task) -> DetectedObject:
-    mesh = read_mesh(task.path, task.scale)
+    mesh = read_mesh(task.path, task.scale, tessellation_mm=task.tessellation_mm)
     if mesh.is_flat:
         raise UserError(f"{task.path}: all its points lie in one plane; a part with a thickness is needed")
     try:

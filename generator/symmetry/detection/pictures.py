@@ -18,6 +18,7 @@ from synthetless.annotation.instances import PosedModel
 from synthetless.annotation.raycast import RayCaster
 from synthetless.errors import UserError
 from synthetless.extras import cv2
+from synthetless.io.cad import TESSELLATION_MM
 from synthetless.io.files import atomic_write
 from synthetless.io.images import encode_png
 from synthetless.io.meshes import TriangleMesh, read_mesh
@@ -64,6 +65,7 @@ def draw_detected(detected: DetectedFolder, to: Path, workers: int | None = None
         _Task(
             path=o.path,
             scale=detected.scale,
+            tessellation_mm=detected.tessellation_mm,
             target=to / f"obj_{o.obj_id:06d}.png",
             title=f"object {o.obj_id}",
             tolerance_percent=100 * o.detected.tolerance_mm / o.detected.diameter_mm,
@@ -111,6 +113,7 @@ class _Task:
     title: str
     tolerance_percent: float
     shown: tuple[GroupFit | SymmetryGroup, ...]
+    tessellation_mm: float = TESSELLATION_MM
 
 
 def _draw_all(tasks: list[_Task], workers: int | None) -> None:
@@ -119,7 +122,7 @@ def _draw_all(tasks: list[_Task], workers: int | None) -> None:
 
 
 def _draw(task: _Task) -> None:
-    mesh = read_mesh(task.path, task.scale)
+    mesh = read_mesh(task.path, task.scale, tessellation_mm=task.tessellation_mm)
     tolerance_mm = task.tolerance_percent / 100 * mesh.diameter_mm
     fits = [
         shown if isinstance(shown, GroupFit) else measure(mesh.vertices_mm, mesh.faces, mesh.diameter_mm, shown)
