@@ -1,9 +1,10 @@
-"""How objects lie in a recipe's drops, beside real T-LESS test images.
+"""How objects lie in a recipe's drops, beside real T-LESS test images, and how bright the pictures of datasets are.
 
     python -m benchmarks.realism configs/tless_bop.yaml --models DIR
+    python -m benchmarks.realism --pictures DATASET ...
 
-Physics and ray casting alone, nothing is rendered: 200 drops of 10 objects take about 4 minutes of one core. With
-``--set key=value`` a recipe can be tuned until its row is that of the real images. Prints a table and writes
+Of recipes, physics and ray casting alone, nothing is rendered: 200 drops of 10 objects take about 4 minutes of one
+core. With ``--set key=value`` a recipe can be tuned until its row is that of the real images. Prints a table and writes
 benchmarks/results/realism.json. Needs Blender.
 """
 
@@ -23,8 +24,10 @@ from benchmarks import ROOT, keep, parser
 from synthetless.annotation.raycast import RayCaster
 from synthetless.annotation.scene import annotate_scene, scene_caster
 from synthetless.config import Recipe, load_recipe
+from synthetless.dataset.reader import Dataset
 from synthetless.generation.sources import Sources, cached_collider, load_sources
 from synthetless.io.cache import Cache
+from synthetless.io.color import mean_luminance
 from synthetless.io.parallel import each
 from synthetless.scenes.collider import Collider
 from synthetless.scenes.physics import NotSettled, PhysicsSettings, settle
@@ -90,6 +93,10 @@ OF_REAL_IMAGES = {
 """The same of 1000 real T-LESS test images, whose poses were ray-cast, by the rows of the table."""
 
 
+CLIPPED, TOLERATED = 254, 0.01
+"""A pixel with a channel at this level or above is clipped; so many of an image's pixels may be."""
+
+
 @dataclass(frozen=True)
 class Lying:
     """How an object lies in a drop: its lowest point above what the drop lies on, and where its z axis points."""
@@ -135,7 +142,8 @@ class Task:
 def main() -> None:
     """Measure, print, write."""
     options = parser(__doc__)
-    options.add_argument("recipe", type=Path, nargs="*", default=[ROOT / "configs" / "tless_bop.yaml"])
+    options.add_argument("recipe", type=Path, nargs="*", help="configs/tless_bop.yaml, if nothing else is given")
+    options.add_argument("--pictures", type=Path, nargs="+", default=[], metavar="DATASET", help="with rgb images")
     options.add_argument("--drops", type=int, default=200)
     options.add_argument("--first", type=int, default=0, help="number of the first drop")
     options.add_argument("--views", type=int, default=4, help="of each drop")
@@ -145,7 +153,13 @@ def main() -> None:
     sources = [f"source.{name}={json.dumps(getattr(arguments, name))}" for name in ("models", "textures")]
     views = [f"camera.elevation_deg={list(ELEVATIONS_DEG)}", f"camera.views_per_drop={arguments.views}"]
     rows = {}
-    for path in arguments.recipe:
+    for path in arguments.pictures:
+        rows[str(path)] = brightness(Dataset.open(path))
+        print(f"\n{path}")
+        for name, value in rows[str(path)].items():
+            print(f"  {name:48} {value}")
+    recipes = arguments.recipe or ([] if arguments.pictures else [ROOT / "configs" / "tless_bop.yaml"])
+    for path in recipes:
         recipe = load_recipe(path, [*sources, *views, *arguments.set])
         tasks = [Task(recipe.model_dump_json(), arguments.first + number) for number in range(arguments.drops)]
         drops = list(each(make, tasks, arguments.workers, path.name, "drop"))
@@ -155,6 +169,28 @@ def main() -> None:
         for name, value in rows[path.name].items():
             print(f"  {name:48} {value:28} {OF_REAL_IMAGES.get(name, '')}".rstrip())
     keep("realism", rows)
+
+
+def brightness(dataset: Dataset) -> dict[str, str]:
+    """What is counted of a dataset's pictures, by name."""
+    pictures = [image.rgb() for image in dataset]
+    clipped = np.array([float((rgb >= CLIPPED).any(axis=2).mean()) for rgb in pictures])
+    luminance = np.array([mean_luminance(rgb) for rgb in pictures])
+    objects = [
+        255 * mean_luminance(rgb[mask][:, None])
+        for rgb, image in zip(pictures, dataset, strict=True)
+        for instance in image.instances
+        if (mask := instance.mask_visib()).any()
+    ]
+    return {
+        "images": f"{len(pictures)}",
+        "of which more than 1 % of the pixels clip": f"{np.mean(clipped > TOLERATED):.3f}",
+        "clipped share of an image, median, q95, largest": " ".join(
+            f"{value:.4f}" for value in np.quantile(clipped, (0.5, 0.95, 1.0))
+        ),
+        "mean luminance of an image, displayed, range": f"{luminance.min():.2f} {luminance.max():.2f}",
+        "luminance of an object, 8 bits, mean, spread": f"{np.mean(objects):.0f} {np.std(objects):.0f}",
+    }
 
 
 def make(task: Task) -> Drop:
