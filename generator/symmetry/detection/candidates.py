@@ -62,18 +62,30 @@ class Candidate:
 class CandidateSearch:
     """Finds the groups that a mesh could have."""
 
-    def __init__(self, surface: Surface, diameter_mm: float, tolerance_mm: float, dense: Floats) -> None:
-        """Take the mesh, what deviation is tolerated, and densely spread surface points (N, 3)."""
+    def __init__(
+        self,
+        surface: Surface,
+        diameter_mm: float,
+        tolerance_mm: float,
+        dense: Floats,
+        has_time: Callable[[], bool] = lambda: True,
+    ) -> None:
+        """Take the mesh, what deviation is tolerated, densely spread surface points (N, 3), and what says whether to go
+        on."""
         self._surface, self._diameter, self._tolerance = surface, diameter_mm, tolerance_mm
         self._field = DistanceField(surface.centroid, dense)
         self._points, self._many_points = surface.sampled(_POINTS), surface.sampled(_MANY_POINTS)
         self._near = max(_NEAR * diameter_mm, 1.5 * tolerance_mm)
+        self._has_time = has_time
 
     def candidates(self) -> list[Candidate]:
-        """Groups that differ, by rising misfit."""
+        """Groups that differ, by rising misfit; where time runs out, those that were found until then."""
         found = [self._candidate(SymmetryGroup("SO(3)", offset_mm=tuple(self._surface.centroid)))]
         for axis in self._axes():
-            found += [self._candidate(group) for group in self._about(axis)]
+            for group in self._about(axis) if self._has_time() else ():
+                found.append(self._candidate(group))
+                if not self._has_time():
+                    break
         found.sort(key=lambda candidate: candidate.misfit_mm)
         distinct: list[Candidate] = []
         for candidate in found:
@@ -92,13 +104,13 @@ class CandidateSearch:
 
     def _axes(self) -> list[SymmetryGroup]:
         """The likeliest axes as fitted groups C_p, p the prime that showed them."""
-        peaks = [peak for p in _PRIMES for peak in self._peaks(p)]
+        peaks = [peak for p in _PRIMES if self._has_time() for peak in self._peaks(p)]
         peaks.sort(key=lambda peak: peak[0])
         chosen: list[SymmetryGroup] = []
         unlikely = dict.fromkeys(_PRIMES, 0)
         for misfit, p, direction in peaks:
             enough = misfit > self._near and len(chosen) >= _FAR_AXES
-            if enough or unlikely[p] == _UNLIKELY_AXES or _is_among(direction, chosen):
+            if enough or unlikely[p] == _UNLIKELY_AXES or _is_among(direction, chosen) or not self._has_time():
                 continue
             axis = placed(f"C{p}", frame_of_axis(direction), self._surface.centroid)
             axis = refined(axis, self._surface, self._points, self._diameter, _AXIS_STEPS)

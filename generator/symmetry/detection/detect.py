@@ -203,7 +203,8 @@ class _Detector:
         sphere = self._refined(SymmetryGroup("SO(3)", offset_mm=tuple(self._surface.centroid)))
         if sphere[1] < _CLEARLY_WITHIN * self._tolerance:  # there is nothing larger
             return [sphere]
-        search = CandidateSearch(self._surface, self._meter.diameter_mm, self._tolerance, self._meter.dense)
+        meter = self._meter
+        search = CandidateSearch(self._surface, meter.diameter_mm, self._tolerance, meter.dense, self._has_time)
         candidates = search.candidates()
         likely = [c for c in candidates if c.is_likely]
         unlikely = [c for c in candidates if not c.is_likely]

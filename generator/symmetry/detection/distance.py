@@ -17,7 +17,8 @@ Indices = NDArray[np.int64]
 PIECE = 0.03
 """A good length for a surface's pieces, as a share of the diameter."""
 
-_NEIGHBOURS = 8
+_NEIGHBOURS, _MOST_NEIGHBOURS = 8, 128
+_FAR = 0.9  # of the largest distance: what decides about it
 _BLOCK = 8192
 _MOST_PIECES = 100_000  # about as many pieces as a surface is cut into beyond its triangles: no part needs as many
 _GRID = 112
@@ -74,9 +75,13 @@ class Surface:
             found[block] = self._nearest(points[block])[0]
         return found
 
-    def closest(self, points: Floats) -> Closest:
-        """The nearest surface points, with the accuracy of `distance`."""
+    def closest(self, points: Floats, surely: bool = False) -> Closest:
+        """The nearest surface points, with the accuracy of `distance`. `surely`: among many more pieces where the
+        distance is near the largest, since one point that is said to be too far off spoils a maximum."""
         distance, triangle = self._nearest(points)
+        if surely:
+            far = np.flatnonzero(distance > _FAR * distance.max())
+            distance[far], triangle[far] = self._surely_nearest(points[far])
         a, e1, e2, normal = (self._planar[triangle, k : k + 3] for k in (0, 3, 6, 9))
         _, x, y = _in_plane(points, self._planar[triangle])
         return Closest(distance, a + x[:, None] * e1 + y[:, None] * e2, normal)
@@ -103,12 +108,29 @@ class Surface:
         return np.asarray(a + u[:, None] * (b - a) + v[:, None] * (c - a))
 
     def _nearest(self, points: Floats) -> tuple[Floats, Indices]:
-        _, pieces = self._tree.query(points, k=min(_NEIGHBOURS, len(self._parent)))
+        distance, triangle, _ = self._nearest_of(points, _NEIGHBOURS)
+        return distance, triangle
+
+    def _surely_nearest(self, points: Floats) -> tuple[Floats, Indices]:
+        """The same among ever more pieces, until no other one can be nearer, or they are too many."""
+        distance, triangle = np.empty(len(points)), np.empty(len(points), np.int64)
+        rest, neighbours = np.arange(len(points)), _NEIGHBOURS
+        while len(rest):
+            distance[rest], triangle[rest], farthest = self._nearest_of(points[rest], neighbours)
+            rest = rest[farthest - self._radius < distance[rest]]
+            if neighbours >= min(_MOST_NEIGHBOURS, len(self._parent)):
+                break
+            neighbours *= 4
+        return distance, triangle
+
+    def _nearest_of(self, points: Floats, neighbours: int) -> tuple[Floats, Indices, Floats]:
+        """Distances (N,), triangles (N,), and how far the farthest centre of so many pieces is, (N,)."""
+        away, pieces = self._tree.query(points, k=min(neighbours, len(self._parent)))
         triangles = self._parent[pieces.reshape(len(points), -1)]
         squared, _, _ = _in_plane(points[:, None], self._planar[triangles])
         best = np.argmin(squared, axis=1)
         rows = np.arange(len(points))
-        return np.sqrt(squared[rows, best]), triangles[rows, best]
+        return np.sqrt(squared[rows, best]), triangles[rows, best], away.reshape(len(points), -1)[:, -1]
 
 
 def _longest_edge_first(corners: Floats) -> Floats:

@@ -71,14 +71,20 @@ def _step(
 
 
 def _linearised(
-    group: SymmetryGroup, surface: Surface, points: Floats, elements: Floats, diameter_mm: float
+    group: SymmetryGroup,
+    surface: Surface,
+    points: Floats,
+    elements: Floats,
+    diameter_mm: float,
+    surely: bool = False,
 ) -> tuple[Floats, Floats]:
     """How far points (N, 3) are off the surface after elements (N, 4), mm, and how that changes, (N, 6), with a turn of
-    the group (in rad times half the diameter, so that turns and shifts are comparable) and a shift (mm)."""
+    the group (in rad times half the diameter, so that turns and shifts are comparable) and a shift (mm); `surely` as
+    in `Surface.closest`."""
     center = np.array(group.offset_mm)
     matrices, before = to_matrix(elements), points - center
     images = np.einsum("nij,nj->ni", matrices, before)
-    found = surface.closest(images + center)
+    found = surface.closest(images + center, surely)
     apart = images + center - found.point
     far = found.distance > 1e-6 * diameter_mm
     gradient = np.where(far[:, None], apart / np.where(far, found.distance, 1)[:, None], found.normal)
@@ -112,7 +118,7 @@ def _with_smallest_maximum(
 ) -> tuple[SymmetryGroup, float]:
     """The placement with the smallest largest deviation of some points (N, 3) after elements (N, 4), which are given in
     the group's standard frame, and the reach of the last steps."""
-    distance, jacobian = _linearised(group, surface, points, _in_model_frame(group, local), diameter_mm)
+    distance, jacobian = _linearised(group, surface, points, _in_model_frame(group, local), diameter_mm, surely=True)
     for _ in range(_LINEAR_STEPS):
         near = distance > distance.max() - 4 * reach
         limits = np.column_stack([jacobian[near], np.full(int(near.sum()), -1.0)])
@@ -121,7 +127,7 @@ def _with_smallest_maximum(
         if solved.x is None:
             break
         trial = _moved(group, solved.x[:3] / (diameter_mm / 2), solved.x[3:6])
-        tried = _linearised(trial, surface, points, _in_model_frame(trial, local), diameter_mm)
+        tried = _linearised(trial, surface, points, _in_model_frame(trial, local), diameter_mm, surely=True)
         if tried[0].max() < distance.max() - 1e-3 * reach:
             group, (distance, jacobian) = trial, tried
         else:
