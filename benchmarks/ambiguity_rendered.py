@@ -97,10 +97,11 @@ class Compared:
     def contradictions(self) -> int:
         """Cosets that one of the two tells from the true pose, and the other does not.
 
-        Of those that few pixels tell from it, less than MIN_PIXELS, a picture may show the difference.
+        Of those that few pixels tell from it, less than MIN_PIXELS, a picture may show the difference; and a single
+        pixel of a picture may be noise.
         """
         by_rays = self.apart >= MIN_PIXELS
-        return int(np.count_nonzero((by_rays != (self.rendered_apart > 0)) & (by_rays | (self.apart == 0))))
+        return int(np.count_nonzero((by_rays != (self.rendered_apart > 1)) & (by_rays | (self.apart == 0))))
 
 
 def compare(instances: int, log: Path = Path(os.devnull)) -> Iterator[Compared]:
