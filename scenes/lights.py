@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from synthetless.scenes.materials import glowing, new_light_image
 from synthetless.scenes.spec import AmbientLight, AreaLight, PointLight, RoomSpec, Vector
 
+_SAMPLING_MAP_PX = 1024
+"""Width of the map by which Cycles aims at the bright parts of a panorama; the sun is wider than its pixels."""
 _FLOOR_M = 0.75
 """How far a room's floor lies below the table."""
 
@@ -114,6 +116,8 @@ def add_panorama(bpy: Any, world: Any, light: NDArray[np.float32], turn_deg: flo
     links.new(turned.outputs["Vector"], texture.inputs["Vector"])
     links.new(texture.outputs["Color"], nodes["Background"].inputs["Color"])
     nodes["Background"].inputs["Strength"].default_value = 1.0
+    world.cycles.sampling_method = "MANUAL"  # by itself, Cycles takes a second and a half of every image for its map
+    world.cycles.sample_map_resolution = _SAMPLING_MAP_PX
 
 
 def add_ambient(bpy: Any, scene: Any, ambient: AmbientLight) -> None:

@@ -63,7 +63,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> BlenderSession:
         for key, shape in shapes.items()
     }
     log = tmp_path_factory.mktemp("light") / "log"
-    settings = RenderSettings(samples=64, denoiser="none", bounces=1)
+    settings = RenderSettings(samples=32, denoiser="none", bounces=1)
     return BlenderSession(meshes, CAMERA, settings, TableSettings(size_m=0.5), log=log)
 
 
