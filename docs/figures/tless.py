@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from synthetless.dataset import Dataset
 from synthetless.dataset.labels import box_corners_mm
 from synthetless.dataset.records import ModelInfo
-from synthetless.dataset.sheet import class_color
+from synthetless.dataset.palette import class_color
 from synthetless.io import images
 from synthetless.io.files import atomic_write, read_bytes
 from synthetless.preview.image import Segment, axis_lines, box_lines

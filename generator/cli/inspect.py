@@ -66,9 +66,15 @@ def preview_command(
     split: Split = None,
     images: Annotated[int | None, typer.Option(min=1, metavar="N", help="Show at most so many, evenly spread.")] = None,
     workers: Workers = None,
+    copy: Annotated[
+        bool, typer.Option("--copy", help="Copy the pictures into it, for a folder to send; else it links to them.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the statistics as JSON.")] = False,
 ) -> None:
-    """Make a gallery and statistics for the browser."""
+    """Make a gallery and statistics for the browser.
+
+    Images that have not changed since the last time are not drawn again.
+    """
     need("jinja2")
     need("matplotlib")
     from synthetless.dataset.labels import undisturbed
@@ -76,8 +82,12 @@ def preview_command(
     from synthetless.preview import write_preview
     from synthetless.preview.pages import STATISTICS_FILE
 
+    def opens(page: Path) -> None:
+        if not as_json:
+            say(f"preview: {page} opens already; the other images are being drawn")
+
     with undisturbed(dataset, may_grow=True):
-        page = write_preview(dataset, to, split, images, workers)
+        page = write_preview(dataset, to, split, images, workers, copy, opens)
     statistics = read_json(page.parent / STATISTICS_FILE)
     say(json.dumps({"page": str(page), "statistics": statistics}) if as_json else f"preview: {page}")
 

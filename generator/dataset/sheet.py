@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synthetless.dataset.layout import ScenePaths, scene_ids
+from synthetless.dataset.palette import Color, class_color
 from synthetless.dataset.reader import Image, Scene
 from synthetless.errors import UserError
 from synthetless.extras import cv2
@@ -18,7 +19,6 @@ from synthetless.io.files import atomic_write
 from synthetless.io.models import BOX_EDGES
 
 Pixels = NDArray[np.uint8]
-Color = tuple[int, int, int]
 
 _TILE_PX = 320
 
@@ -64,14 +64,6 @@ def _draw_box(image: Pixels, corners_px: NDArray[np.float64], color: Color) -> N
     for a, b in BOX_EDGES:
         cv2.line(image, tuple(points[a].tolist()), tuple(points[b].tolist()), color, 1, cv2.LINE_AA, shift=4)
     cv2.circle(image, tuple(points[0].tolist()), 3 * 16, color, -1, cv2.LINE_AA, shift=4)
-
-
-def class_color(obj_id: int) -> Color:
-    """A bright RGB colour for an object id; neighbouring ids are far apart."""
-    hue = int(obj_id * 0.618034 % 1 * 180)
-    pixel = cv2.cvtColor(np.array([[[hue, 200, 255]]], dtype=np.uint8), cv2.COLOR_HSV2RGB)
-    red, green, blue = (int(value) for value in pixel[0, 0])
-    return red, green, blue
 
 
 def _row(tiles: Sequence[Pixels], columns: int) -> Pixels:

@@ -35,6 +35,7 @@ from synthetless.io.files import (
     atomic_folder,
     atomic_write,
     json_bytes,
+    link_or_copy,
     locked,
     read_json,
     write_json,
@@ -128,13 +129,10 @@ def _share(source: DatasetStore, target: DatasetStore) -> None:
 
 
 def _share_file(file: Path, to: Path) -> None:
-    to.parent.mkdir(parents=True, exist_ok=True)
     if file.suffix in _LINKED:
-        try:
-            to.hardlink_to(file)
-            return
-        except OSError:  # another disk, or one without hard links
-            pass
+        link_or_copy(file, to)
+        return
+    to.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(file, to)
 
 

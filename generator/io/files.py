@@ -71,6 +71,22 @@ def replace_file(source: Path, target: Path) -> None:
         source.unlink()
 
 
+def link_or_copy(source: Path, target: Path) -> None:
+    """Give a file that is never changed in place a second name; a copy where the disk has no hard links.
+
+    Raises:
+        UserError: it cannot be read, or not be written there.
+    """
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            target.hardlink_to(source)
+        except OSError:  # another disk, or one without hard links
+            shutil.copyfile(source, target)
+    except OSError as error:
+        raise UserError(f"{target}: cannot be written ({error.strerror or error})") from error
+
+
 @contextmanager
 def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
     """A folder to fill, which becomes ``path`` when the block ends well and vanishes otherwise.

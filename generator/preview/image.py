@@ -5,11 +5,14 @@ What is drawn is data, as outlines and lines in pixels of the image; pixel (i, j
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +24,7 @@ from synthetless.dataset.records import ImageSpec, ModelInfo
 from synthetless.errors import UserError
 from synthetless.extras import cv2
 from synthetless.io import images
-from synthetless.io.files import atomic_write, read_bytes
+from synthetless.io.files import atomic_write, link_or_copy, read_bytes
 from synthetless.io.models import BOX_EDGES
 from synthetless.scenes.spec import EnvironmentSpec, Material, PlaneSpec, RoomSpec, SensorSpec, Vector, View
 from synthetless.scenes.srgb import srgb_from_linear
@@ -35,11 +38,26 @@ Segment = list[float]
 """A line in the image: [u, v, u', v']."""
 Section = dict[str, Any]
 
+_DRAWING = 2
+"""Goes up when something else is drawn from the same dataset, so that no former drawing is taken for a new one."""
 _GREY = np.uint8(128)
 _LARGEST_PX, _THUMBNAIL_PX = 1280, 256
 _QUALITY = 90
 _NEAR_MM = 10.0
 _TOLERANCE_PX = 0.6
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What was drawn of an image.
+
+    Attributes:
+        digest: of everything that the drawing depends on.
+        files: its files, relative to the folder of the pages.
+    """
+
+    digest: str
+    files: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -49,10 +67,13 @@ class ImageTask:
     Attributes:
         image: what the dataset says of it; every instance has a label and visibility.
         recorded: how it was made, if that was recorded.
-        infos: models_info.json.
+        infos: models_info.json of the objects in it.
         symmetries: symmetries.json, if instances have a ``quasi``.
         size_px: width and height, if camera.json says them; used where there is no picture.
-        to: the folder of the pages.
+        to: the folder to write to.
+        pages: where that folder will be when it is whole: links to the dataset's own pictures begin there.
+        copy: have copies of those pictures instead of links.
+        former: what a former preview in ``pages`` has of the image.
     """
 
     image: Image
@@ -61,29 +82,89 @@ class ImageTask:
     symmetries: SymmetryTable | None
     size_px: tuple[int, int] | None
     to: Path
+    pages: Path
+    copy: bool
+    former: Drawn | None
 
     @property
     def key(self) -> str:
-        """What the image is called: SCENE/IMAGE."""
-        return f"{self.image.paths.root.name}/{self.image.im_id:06d}"
+        return image_key(self.image)
 
 
-def write_image(task: ImageTask) -> str:
-    """Write the files of an image into the folder of the pages, and return its key.
+def image_key(image: Image) -> str:
+    """What the pages call an image: SCENE/IMAGE."""
+    return f"{image.paths.root.name}/{image.im_id:06d}"
+
+
+def write_image(task: ImageTask) -> Drawn:
+    """Write the files of an image into the folder of the pages, or take over those of a former preview.
 
     Raises:
         UserError: a file of the dataset is damaged, or one of the pages cannot be written.
     """
+    digest = _digest(task)
+    if task.former is not None and task.former.digest == digest and _taken_over(task, task.former):
+        return task.former
+    return Drawn(digest, tuple(_draw(task)))
+
+
+def _digest(task: ImageTask) -> str:
+    """Of what the labels say, and of which files the pictures are; a file is known by its size and time."""
+    image = task.image
+    said = [
+        [
+            [each.gt_id, each.obj_id, each.R_m2c.tolist(), each.t_m2c.tolist()],
+            [_plain(each.label), _plain(each.visibility)],
+            [each.quasi is not None, [(R.tolist(), t.tolist()) for R, t in _alike(each, task.symmetries)]],
+        ]
+        for each in image.instances
+    ]
+    paths = [image.paths.find_rgb(image.im_id), image.paths.depth(image.im_id), image.paths.normals(image.im_id)]
+    for each in image.instances:
+        paths += [of(image.im_id, each.gt_id) for of in (image.paths.mask, image.paths.mask_visib)]
+    files = [_identity(path) for path in paths if path is not None]
+    link = None if task.copy or paths[0] is None else _link(task, paths[0])
+    whole = [_DRAWING, image.K.tolist(), said, repr(task.recorded), repr(task.infos), task.size_px, files, link]
+    return hashlib.sha256(repr(whole).encode()).hexdigest()[:32]
+
+
+def _plain(record: Any) -> dict[str, Any]:
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(record).items()}
+
+
+def _identity(path: Path) -> tuple[str, int, int] | None:
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return None
+    return path.name, found.st_size, found.st_mtime_ns
+
+
+def _taken_over(task: ImageTask, former: Drawn) -> bool:
+    """Give the files of a former preview a place in the new one; whether all were there."""
+    if not all((task.pages / name).is_file() for name in former.files):
+        return False
+    for name in former.files:
+        link_or_copy(task.pages / name, task.to / name)
+    return True
+
+
+def _draw(task: ImageTask) -> Iterator[str]:
+    """Write an image's files; gives the name of each."""
     depth, depth_mm = _depth_view(task.image)
     found = {"rgb": _rgb_view(task.image), "depth": depth, "normals": _normals_view(task.image)}
     views = {name: pixels for name, pixels in found.items() if pixels is not None}
     shown = {name: f"images/{task.key}-{name}.jpg" for name in views}
+    picture = task.image.paths.find_rgb(task.image.im_id)
+    if picture is not None and not task.copy:
+        shown["rgb"] = _link(task, picture)
     for name, pixels in views.items():
-        atomic_write(task.to / shown[name], _encode(pixels, _LARGEST_PX))
+        if shown[name].startswith("images/"):
+            yield from _file(task, shown[name], _encode(pixels, _LARGEST_PX))
     best = next(iter(views.values()), None)
     width, height = _size_px(task) if best is None else best.shape[1::-1]
     thumbnail = np.full((height, width, 3), _GREY) if best is None else best
-    atomic_write(task.to / f"thumbnails/{task.key}.jpg", _encode(thumbnail, _THUMBNAIL_PX))
+    yield from _file(task, f"thumbnails/{task.key}.jpg", _encode(thumbnail, _THUMBNAIL_PX))
     content = {
         "size": [width, height],
         "sections": _sections(task.image.K, task.recorded),
@@ -92,8 +173,17 @@ def write_image(task: ImageTask) -> str:
         "depth_mm": depth_mm,
     }
     script = f"synthetless.arrived({json.dumps(task.key)}, {json.dumps(content, allow_nan=False)});\n"
-    atomic_write(task.to / f"data/{task.key}.js", script.encode())
-    return task.key
+    yield from _file(task, f"data/{task.key}.js", script.encode())
+
+
+def _file(task: ImageTask, name: str, content: bytes) -> Iterator[str]:
+    atomic_write(task.to / name, content)
+    yield name
+
+
+def _link(task: ImageTask, picture: Path) -> str:
+    """From the pages to a picture of the dataset, as an address: whatever the folders are called."""
+    return quote(os.path.relpath(picture.resolve(), task.pages.resolve()))
 
 
 def _size_px(task: ImageTask) -> tuple[int, int]:

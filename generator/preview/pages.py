@@ -11,20 +11,23 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from synthetless.dataset.sheet import class_color
+from synthetless.dataset.palette import css_color
 from synthetless.errors import UserError
 from synthetless.extras import MissingExtraError
-from synthetless.io.files import atomic_write, read_bytes
+from synthetless.io.files import atomic_write, read_bytes, read_json
+from synthetless.preview.image import Drawn
 from synthetless.preview.plots import plots
 from synthetless.preview.statistics import Statistics
 
 PAGE_FILE, STATISTICS_PAGE, STATISTICS_FILE = "index.html", "statistics.html", "statistics.json"
-STATIC_FILES = ("preview.css", "gallery.js", "viewer.js")
-_FILES = {PAGE_FILE, STATISTICS_FILE, STATISTICS_PAGE, "data/index.js", *STATIC_FILES}
+DRAWN_FILE = "drawn.json"
+STATIC_FILES = ("preview.css", "gallery.js", "zoom.js", "viewer.js")
+_FILES = {PAGE_FILE, DRAWN_FILE, STATISTICS_FILE, STATISTICS_PAGE, "data/index.js", *STATIC_FILES}
 _DATA_FILE = re.compile(
     r"(data/\d{6,}/\d{6,}\.js|thumbnails/\d{6,}/\d{6,}\.jpg|plots/\w+\.svg"
     r"|images/\d{6,}/\d{6,}-(rgb|depth|normals)\.jpg)"
 )
+_FEW_IMAGES = 100  # for charts of every class: below, they are folded
 _GROUPS = ("labels", "objects", "camera", "light", "table", "image")
 _PACKAGE = "synthetless.preview"
 _MARK = '<meta name="generator" content="synthetless preview">'
@@ -52,6 +55,29 @@ def _text(page: Path) -> str:
     return read_bytes(page).decode("utf-8", errors="replace")
 
 
+def read_drawn(folder: Path) -> dict[str, Drawn]:
+    """What a former preview has drawn of each image, by its key; nothing if it does not say."""
+    try:
+        content = read_json(folder / DRAWN_FILE)
+        return {key: Drawn(digest, tuple(files)) for key, (digest, files) in content.items() if _known(files)}
+    except (UserError, AttributeError, TypeError, ValueError):
+        return {}
+
+
+def _known(files: Any) -> bool:
+    return all(_DATA_FILE.fullmatch(name) for name in files)
+
+
+def write_drawn(folder: Path, drawn: Mapping[str, Drawn]) -> None:
+    """Keep what was drawn of each image, for the next preview.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    content = {key: [each.digest, each.files] for key, each in drawn.items()}
+    atomic_write(folder / DRAWN_FILE, json.dumps(content, separators=(",", ":")).encode())
+
+
 def write_pages(folder: Path, title: str, split: str, images: int) -> None:
     """Write the gallery's page and what it needs beside the data.
 
@@ -77,13 +103,16 @@ def write_statistics(folder: Path, title: str, of: Statistics, names: Mapping[in
     ordered = sorted(of.distributions, key=lambda each: _GROUPS.index(each.group))
     groups = [(group, list(members)) for group, members in groupby(ordered, key=lambda each: each.group)]
     page = render(
-        "statistics.html", title=title, of=of, groups=groups, names=names, recipe=of.drops > 0, colour=_colour
+        "statistics.html",
+        title=title,
+        of=of,
+        groups=groups,
+        names=names,
+        recipe=of.drops > 0,
+        few=_FEW_IMAGES,
+        colour=css_color,
     )
     atomic_write(folder / STATISTICS_PAGE, page.encode())
-
-
-def _colour(obj_id: int) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*class_color(obj_id))
 
 
 def render(template: str, **values: Any) -> str:

@@ -23,7 +23,7 @@ from synthetless.preview.statistics import (
     Statistics,
     cell_outlines,
 )
-from synthetless.symmetry.atlas import SCHEMES
+from synthetless.symmetry.atlas import SCHEMES, Scheme
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 
 _INK, _LIGHT_INK = "#41474e", "#c4cad1"
 _BAR, _ASKED, _LINE = "#5b8fd6", "#e0862e", "#9aa1a9"
-_REGRESSORS = ("#5b8fd6", "#e0862e", "#4fa78a", "#b77bc9", "#c9a13b", "#d1605e", "#7f8c99", "#8cae4a")
+_REGRESSORS = ("#7b4fa3", "#4fa78a", "#d6c04a", "#b5486a", "#2f5d8a", "#8cae4a", "#b79fd6", "#7f8c99")
+_SCHEMES: dict[Scheme, str] = {"pitteri2019": "#a3485c", "atlas": "#2e8b96"}
+_TRUE, _CANONICAL = "#8d8f94", "#3d7a4a"
 _STYLE: Any = {
     "svg.hashsalt": "synthetless",
     "svg.fonttype": "none",
@@ -131,7 +133,7 @@ def near_jump_plot(classes: Sequence[ClassStatistics]) -> bytes:
     places = np.arange(len(classes))
     for number, scheme in enumerate(SCHEMES):
         middle = places + 0.4 * (number - 0.5)
-        color = _REGRESSORS[number]
+        color = _SCHEMES[scheme]
         axes.bar(middle, [100 * each.near_jump[scheme].share for each in classes], 0.36, color=color, label=scheme)
         random = [100 * each.near_jump[scheme].random for each in classes]
         axes.hlines(random, middle - 0.2, middle + 0.2, color=_INK, linewidth=1.2)
@@ -146,9 +148,12 @@ def coverage_plot(classes: Sequence[ClassStatistics]) -> bytes:
     """Percent of the viewing sphere that is seen; lines for as many views uniform on the sphere."""
     figure, axes = _figure(10.4, 2.1)
     places = np.arange(len(classes))
-    columns = (("true pose", [c.coverage for c in classes]), ("canonical", [c.coverage_canonical for c in classes]))
-    for number, (name, shares) in enumerate(columns):
-        axes.bar(places + 0.4 * (number - 0.5), 100 * np.array(shares), 0.36, color=_REGRESSORS[number], label=name)
+    columns = (
+        ("true pose", _TRUE, [c.coverage for c in classes]),
+        ("canonical", _CANONICAL, [c.coverage_canonical for c in classes]),
+    )
+    for number, (name, color, shares) in enumerate(columns):
+        axes.bar(places + 0.4 * (number - 0.5), 100 * np.array(shares), 0.36, color=color, label=name)
     axes.hlines([100 * c.coverage_uniform for c in classes], places - 0.4, places + 0.4, color=_INK, linewidth=1.2)
     _class_axis(axes, classes)
     axes.set_ylabel("% of cells")

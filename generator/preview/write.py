@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+import shutil
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,20 +15,30 @@ from tqdm import tqdm
 
 from synthetless.dataset.labels import box_corners_mm
 from synthetless.dataset.layout import AMBIGUITY_FILE, CAMERA_FILE, PREVIEW_FOLDER, find_models_folder, refuse_target
+from synthetless.dataset.palette import css_color
 from synthetless.dataset.reader import Dataset, Image, Scene, read_specs
 from synthetless.dataset.records import ImageSpec, ModelInfo, read_scene_json
 from synthetless.errors import UserError
 from synthetless.io.files import atomic_folder, atomic_write, read_json
 from synthetless.io.models import INFO_FILE
 from synthetless.io.parallel import processes
-from synthetless.preview.image import ImageTask, write_image
-from synthetless.preview.pages import PAGE_FILE, refuse_others, write_pages, write_statistics
+from synthetless.preview.image import Drawn, ImageTask, image_key, write_image
+from synthetless.preview.pages import (
+    PAGE_FILE,
+    read_drawn,
+    refuse_others,
+    write_drawn,
+    write_pages,
+    write_statistics,
+)
 from synthetless.preview.statistics import statistics
 from synthetless.symmetry import SymmetryTable
 
 _BATCH = 16  # images that a worker takes at a time
 _LARGEST_MM = 1e9  # of a diameter that can be drawn
 _WORTH_A_PROCESS = 64  # images; starting one takes a second or two
+FIRST_IMAGES = 60
+"""The gallery's first page: it opens while the rest is being drawn."""
 
 
 def write_preview(
@@ -36,8 +47,12 @@ def write_preview(
     split: str | None = None,
     limit: int | None = None,
     workers: int | None = None,
+    copy: bool = False,
+    opens: Callable[[Path], object] = lambda page: None,
 ) -> Path:
     """Write pages that show a dataset, a folder that opens from the disk without a server or a network.
+
+    Images that a former preview in the same place has drawn, and that have not changed since, are not drawn again.
 
     Args:
         dataset: folder of a dataset, or of a BOP dataset that was adopted.
@@ -46,6 +61,9 @@ def write_preview(
         split: the folder of images to show; may be left out where there is only one.
         limit: show at most this many images, evenly spread; all if None.
         workers: processes; one per available core if None.
+        copy: put copies of the pictures beside the pages, for a folder to send; else the pages show the dataset's own.
+        opens: called with the page as soon as it opens, where there are more images than on the gallery's first page
+            and no former preview; the others are drawn meanwhile.
 
     Returns:
         The page to open.
@@ -58,12 +76,17 @@ def write_preview(
     to = dataset / PREVIEW_FOLDER if to is None else to
     refuse_target(dataset, to, own=PREVIEW_FOLDER)
     refuse_others(to)
-    with atomic_folder(to, replace=True) as folder:
-        _write_images(source, folder, workers)
-        write_pages(folder, source.title, source.dataset.split, source.count)
-        names = {obj_id: class_name(obj_id, info) for obj_id, info in source.infos.items()}
-        write_statistics(folder, source.title, statistics(dataset, source.dataset.split), names)
-        refuse_others(to)
+    pages = _Pages(source, to, copy, workers)
+    if source.count <= FIRST_IMAGES or (to / PAGE_FILE).exists():
+        pages.write(source.count)
+    else:
+        pages.write(FIRST_IMAGES)
+        try:
+            opens(to / PAGE_FILE)
+            pages.write(source.count)
+        except BaseException:
+            pages.remove()
+            raise
     return to / PAGE_FILE
 
 
@@ -106,17 +129,17 @@ class _Source:
         name = None if self.dataset.header is None else self.dataset.header.get("name")
         return str(name or self.dataset.root.resolve().name)
 
-    def scenes(self, to: Path) -> Iterator[list[ImageTask]]:
-        """The images to show of each scene folder."""
+    def scenes(self) -> Iterator[list[tuple[Image, ImageSpec | None]]]:
+        """The images to show of each scene folder, and how they were made."""
         wanted = {number * self.total // self.count for number in range(self.count)}
         first = 0
         for scene_id, images in self.images.items():
             numbers = [number - first for number in range(first, first + images) if number in wanted]
             first += images
             if numbers:
-                yield list(self._scene(Scene.read(self.dataset.paths(scene_id)), numbers, to))
+                yield list(self._scene(Scene.read(self.dataset.paths(scene_id)), numbers))
 
-    def _scene(self, scene: Scene, numbers: list[int], to: Path) -> Iterator[ImageTask]:
+    def _scene(self, scene: Scene, numbers: list[int]) -> Iterator[tuple[Image, ImageSpec | None]]:
         scene.labelled()  # refuses one that is not
         for obj_id in np.unique(scene.poses.obj_ids).tolist():
             self._check_object(scene, obj_id)
@@ -126,7 +149,7 @@ class _Source:
             spec = recorded.get(image.im_id)
             if spec is not None and not _fits(spec, image):
                 raise UserError(f"{scene.paths.scene_spec}: image {image.im_id} is not the one of scene_gt.json")
-            yield ImageTask(image, spec, self.infos, self.symmetries, self.size_px, to)
+            yield image, spec
 
     def _check_object(self, scene: Scene, obj_id: int) -> None:
         """An object is drawn by its box and its diameter."""
@@ -165,31 +188,76 @@ def _fits(spec: ImageSpec, image: Image) -> bool:
     )
 
 
-def _write_images(source: _Source, folder: Path, workers: int | None) -> None:
-    index: list[Any] = []
-    with (
-        processes(workers, source.count // _WORTH_A_PROCESS) as run,
-        tqdm(total=source.count, desc="preview", unit="image", disable=None) as bar,
-    ):
-        for tasks in source.scenes(folder):
-            for _ in run(write_image, tasks, chunksize=_BATCH):
-                bar.update()
-            index += [_index_entry(task) for task in tasks]
-    found = sorted({obj_id for _, flat in index for obj_id in flat[::4]})
-    classes = [{"id": obj_id, "name": class_name(obj_id, source.infos[obj_id])} for obj_id in found]
-    content = json.dumps({"images": index, "classes": classes}, separators=(",", ":"), allow_nan=False)
-    atomic_write(folder / "data" / "index.js", f"synthetless.index = {content};\n".encode())
+@dataclass(frozen=True)
+class _Pages:
+    """The folder of pages.
+
+    Attributes:
+        source: what they show.
+        to: where they stand.
+        copy: whether they show copies of the dataset's pictures.
+        workers: processes; one per available core if None.
+    """
+
+    source: _Source
+    to: Path
+    copy: bool
+    workers: int | None
+
+    def write(self, most: int) -> None:
+        """Write all pages, with the first ``most`` images drawn, in the place of those that stand there."""
+        source = self.source
+        names = {obj_id: class_name(obj_id, info) for obj_id, info in source.infos.items()}
+        with atomic_folder(self.to, replace=True) as draft:
+            self._write_images(draft, most)
+            write_pages(draft, source.title, source.dataset.split, source.count)
+            found = statistics(source.dataset.root, source.dataset.split)
+            write_statistics(draft, source.title, found, names)
+            refuse_others(self.to)
+
+    def remove(self) -> None:
+        """Take away pages of which the rest could not be drawn."""
+        refuse_others(self.to)
+        shutil.rmtree(self.to)
+
+    def _write_images(self, draft: Path, most: int) -> None:
+        former, drawn, index = read_drawn(self.to), dict[str, Drawn](), list[Any]()
+        with (
+            processes(self.workers, most // _WORTH_A_PROCESS) as run,
+            tqdm(total=most, desc="preview", unit="image", disable=None) as bar,
+        ):
+            for scene in self.source.scenes():
+                index += [_index_entry(image) for image, _ in scene]
+                tasks = [self._task(image, spec, draft, former) for image, spec in scene[: most - len(drawn)]]
+                for task, each in zip(tasks, run(write_image, tasks, chunksize=_BATCH), strict=True):
+                    drawn[task.key] = each
+                    bar.update()
+        write_drawn(draft, drawn)
+        self._write_index(draft, index)
+
+    def _task(self, image: Image, spec: ImageSpec | None, draft: Path, former: Mapping[str, Drawn]) -> ImageTask:
+        infos = {each.obj_id: self.source.infos[each.obj_id] for each in image.instances}
+        return ImageTask(
+            image, spec, infos, self.source.size_px, draft, self.to, self.copy, former.get(image_key(image))
+        )
+
+    def _write_index(self, draft: Path, index: list[Any]) -> None:
+        found = sorted({obj_id for _, flat in index for obj_id in flat[::4]})
+        infos = self.source.infos
+        classes = [{"id": i, "name": class_name(i, infos[i]), "colour": css_color(i)} for i in found]
+        content = json.dumps({"images": index, "classes": classes}, separators=(",", ":"), allow_nan=False)
+        atomic_write(draft / "data" / "index.js", f"synthetless.index = {content};\n".encode())
 
 
-def _index_entry(task: ImageTask) -> list[Any]:
+def _index_entry(image: Image) -> list[Any]:
     """[key, [object, regressor, visible thousandths, margin in tenths of a degree, ...of the next instance]]."""
     flat: list[int] = []
-    for instance in task.image.instances:
+    for instance in image.instances:
         label, seen = instance.label, instance.visibility
         assert label is not None and seen is not None  # see ImageTask
         visible, margin = round(1000 * seen.visib_fract), round(10 * label.discontinuity_margin_deg)
         flat += [instance.obj_id, label.regressor_index, visible, margin]
-    return [task.key, flat]
+    return [image_key(image), flat]
 
 
 def class_name(obj_id: int, info: ModelInfo) -> str:

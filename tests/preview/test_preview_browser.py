@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from synthetless.dataset.palette import class_color
 from synthetless.dataset.reader import read_specs
 from synthetless.io.images import decode_rgb
+from synthetless.preview import write_preview
 from synthetless.preview.pages import write_pages
 from tests.preview.chromium import console, requested
 from tests.preview.conftest import HOSTILE_NAME, HOSTILE_OBJECT, images_of
@@ -149,7 +152,10 @@ def test_views_and_neighbours_by_key(open_page: Any, keys: list[str]) -> None:
     _open(open_page, keys[2])
     for letter, view in (("d", "depth"), ("n", "normals"), ("i", "rgb")):
         _press(open_page, letter)
-        assert _css(open_page, "#drawing image")[0].get_attribute("href") == f"images/{keys[2]}-{view}.jpg"
+        href = _css(open_page, "#drawing image")[0].get_attribute("href")
+        assert href.endswith(
+            f"{keys[2][:6]}/rgb/{keys[2][7:]}.png" if view == "rgb" else f"images/{keys[2]}-{view}.jpg"
+        )
     _press(open_page, "ArrowRight")
     assert _shows(open_page, keys[3])
     _press(open_page, "ArrowLeft", "ArrowLeft")
@@ -158,6 +164,96 @@ def test_views_and_neighbours_by_key(open_page: Any, keys: list[str]) -> None:
     assert _eventually(open_page, f"return document.activeElement.dataset.key === '{keys[1]}'")
     _press(open_page, "ArrowRight", "Enter")
     assert _shows(open_page, keys[2])
+
+
+def test_the_legend_names_the_dots_and_filters(open_page: Any, small_preview: Path) -> None:
+    index = _index(small_preview)
+    shown = open_page.execute_script(
+        "return [...document.querySelectorAll('#classes button')].map(button =>"
+        "[Number(button.dataset.class), button.textContent, button.querySelector('.dot').style.backgroundColor])"
+    )
+    assert [[obj_id, name] for obj_id, name, _ in shown] == [[each["id"], each["name"]] for each in index["classes"]]
+    assert [colour for *_, colour in shown] == [f"rgb{class_color(obj_id)}" for obj_id, *_ in shown]
+    dots = open_page.execute_script(
+        "return [...document.querySelectorAll('.tile .dot')].map(dot => [dot.title, dot.style.backgroundColor])"
+    )
+    assert {tuple(dot) for dot in dots} == {(name, colour) for _, name, colour in shown}
+    button = _css(open_page, "#classes button")[1]
+    having = [key for key, flat in index["images"] if index["classes"][1]["id"] in flat[::4]]
+    for pressed, expected in (("true", having), ("false", [key for key, _ in index["images"]])):
+        button.click()
+        assert button.get_attribute("aria-pressed") == pressed
+        assert [tile.get_attribute("data-key") for tile in _css(open_page, ".tile")] == expected
+
+
+def test_wheel_keys_drag_and_double_click_zoom(open_page: Any, keys: list[str]) -> None:
+    from selenium.webdriver import ActionChains
+    from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
+
+    def box() -> list[float]:
+        return [float(number) for number in drawing.get_dom_attribute("viewBox").split()]
+
+    _open(open_page, keys[0], overlays="ids")
+    drawing = _css(open_page, "#drawing")[0]
+    whole = [-0.5, -0.5, 128.0, 96.0]
+    assert box() == whole
+    size = drawing.size["width"]
+    origin = ScrollOrigin.from_element(drawing, -size // 4, 0)
+    ActionChains(open_page).scroll_from_origin(origin, 0, -500).perform()
+    assert _eventually(open_page, "return document.getElementById('drawing').classList.contains('zoomed')")
+    x, y, width, height = box()
+    assert width == pytest.approx(32)
+    assert (x + width / 4 + 0.5, y + height / 2 + 0.5) == (pytest.approx(32, abs=1), pytest.approx(48, abs=1))  # stays
+    ActionChains(open_page).drag_and_drop_by_offset(drawing, -size // 2, 0).perform()
+    assert box()[0] == pytest.approx(x + width / 2, abs=0.5)
+    _press(open_page, "d")
+    assert box()[2] == pytest.approx(32)  # the same part of another view
+    _press(open_page, "f")
+    assert box() == whole
+    _press(open_page, "+", "+", "-")
+    assert box()[2] == pytest.approx(128 / 1.5)
+    ActionChains(open_page).double_click(drawing).perform()
+    assert box() == whole
+    ActionChains(open_page).double_click(drawing).perform()
+    assert box()[2] == pytest.approx(32)
+    _press(open_page, "ArrowRight")
+    assert _shows(open_page, keys[1])
+    assert box() == whole
+
+
+def test_two_fingers_zoom(open_page: Any, keys: list[str]) -> None:
+    _open(open_page, keys[0])
+    drawn = _css(open_page, "#drawing")[0].rect
+    x, y = drawn["x"] + drawn["width"] / 2, drawn["y"] + drawn["height"] / 2
+
+    def touch(kind: str, apart: float) -> None:
+        points = [] if kind == "touchEnd" else [{"x": x + side * apart / 2, "y": y, "id": side} for side in (-1, 1)]
+        open_page.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    touch("touchStart", 60)
+    for apart in (80, 100, 120):
+        touch("touchMove", apart)
+    touch("touchEnd", 0)
+    shown = [float(number) for number in _css(open_page, "#drawing")[0].get_dom_attribute("viewBox").split()]
+    assert shown == pytest.approx([31.5, 23.5, 64, 48], abs=1.5)
+
+
+def test_what_is_not_drawn_or_gone_is_told(browser: Any, small_dataset: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(small_dataset, tmp_path / "z")
+    page, image = write_preview(root), images_of(root)[0]
+    picture = image.scene.find_rgb(image.labels.im_id)
+    assert picture is not None
+    picture.unlink()
+    (page.parent / f"thumbnails/{image.key}.jpg").unlink()
+    (page.parent / f"data/{images_of(root)[1].key}.js").unlink()
+    browser.get("about:blank")
+    browser.get(page.as_uri())
+    assert _eventually(browser, f"return document.querySelector('[data-key=\"{image.key}\"].undrawn') !== null")
+    _open(browser, image.key)
+    assert _eventually(browser, "return document.getElementById('legend').textContent.includes('--copy')")
+    browser.execute_script("synthetless.change(arguments[0])", {"image": images_of(root)[1].key})
+    assert _eventually(browser, "return document.getElementById('legend').textContent.includes('load this page again')")
+    console(browser)  # the files that are missing
 
 
 def test_the_recorded_scene_is_told(open_page: Any, small_dataset: Path) -> None:
@@ -178,7 +274,11 @@ def test_the_statistics_load_and_every_plot_is_there(open_page: Any) -> None:
         open_page, "return [...document.images].every(image => image.complete && image.naturalWidth > 0)"
     )
     assert _css(open_page, "h1")[0].text.split() == HOSTILE_NAME.split()
-    assert HOSTILE_OBJECT.split()[0] in _css(open_page, "#statistics")[0].text
+    classes = _css(open_page, "#classes")[0]
+    assert classes.get_dom_attribute("open") is None  # six images say little of a class
+    assert HOSTILE_OBJECT.split()[0] in classes.get_property("textContent")
+    links = [link.get_dom_attribute("href") for link in _css(open_page, ".contents a")]
+    assert links[-1] == "#classes" and all(_css(open_page, link) for link in links)
 
 
 def test_nothing_asks_the_network(open_page: Any, keys: list[str]) -> None:
@@ -205,7 +305,7 @@ def test_thirty_thousand_images_stay_usable(browser: Any, tmp_path: Path) -> Non
             ]
         )
         images.append([f"{1 + number // 1000:06d}/{number % 1000:06d}", numbers.T.ravel().tolist()])
-    index = {"images": images, "classes": [{"id": i, "name": str(i)} for i in range(1, 31)]}
+    index = {"images": images, "classes": [{"id": i, "name": str(i), "colour": "red"} for i in range(1, 31)]}
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "index.js").write_text(f"synthetless.index = {json.dumps(index)};")
     write_pages(tmp_path, "many", "train_synthetless", MANY)

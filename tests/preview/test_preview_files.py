@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote
 
 import cv2
 import numpy as np
@@ -39,7 +41,7 @@ def test_every_image_has_its_files_and_every_file_is_an_images(small_preview: Pa
         detail = _detail(small_preview, key)
         assert list(detail["views"]) == ["rgb", "depth", "normals"]
         for view in detail["views"].values():
-            assert decode_rgb(read_bytes(folder / view)).shape == (96, 128, 3)
+            assert decode_rgb(read_bytes(folder / unquote(view))).shape == (96, 128, 3)
 
 
 def test_the_index_says_what_the_labels_say(small_preview: Path, small_dataset: Path) -> None:
@@ -133,7 +135,7 @@ def test_the_page_shows_a_hostile_name_as_text(small_preview: Path) -> None:
     reader = Reader()
     reader.feed(small_preview.read_text())
     assert reader.heading == HOSTILE_NAME
-    assert reader.scripts == 4
+    assert reader.scripts == 5
 
 
 def test_nothing_is_taken_from_elsewhere(small_preview: Path) -> None:
@@ -161,6 +163,72 @@ def test_a_preview_is_replaced_and_nothing_else(small_dataset: Path, tmp_path: P
     with pytest.raises(ValueError, match="is not a preview"):
         write_preview(small_dataset, letters)
     assert (letters / "index.html").read_text() == "my own page"
+
+
+def test_the_datasets_own_pictures_are_shown_or_copies(small_dataset: Path, tmp_path: Path) -> None:
+    linked = write_preview(small_dataset, tmp_path / "a folder #1 of 100%" / "linked", limit=1).parent
+    copied = write_preview(small_dataset, tmp_path / "copied", limit=1, copy=True).parent
+    key = images_of(small_dataset)[0].key
+    shown = {folder: _detail(folder / "index.html", key)["views"]["rgb"] for folder in (linked, copied)}
+    assert shown[copied] == f"images/{key}-rgb.jpg"
+    path = (linked / unquote(shown[linked])).resolve()
+    assert path == images_of(small_dataset)[0].scene.find_rgb(images_of(small_dataset)[0].labels.im_id)
+    assert not (linked / f"images/{key}-rgb.jpg").exists()
+    small = [_small(each) for each in (copied / shown[copied], path)]  # the pixels are noise, which JPEG smears
+    assert np.abs(small[0] - small[1]).max() < 6 < np.ptp(small[1])
+
+
+def test_what_has_not_changed_is_not_drawn_again(small_dataset: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(small_dataset, tmp_path / "z")
+    folder = write_preview(root).parent
+    before, images = contents(folder), images_of(root)
+    inodes = {path: path.stat().st_ino for path in folder.rglob("*.j*g")}
+    write_preview(root)
+    assert contents(folder) == before
+    assert {path: path.stat().st_ino for path in folder.rglob("*.j*g")} == inodes
+    depth = images[1].scene.depth(images[1].labels.im_id)
+    depth.write_bytes(images[2].scene.depth(images[2].labels.im_id).read_bytes())
+    (folder / f"images/{images[3].key}-depth.jpg").unlink()
+    write_preview(root)
+    assert {key for key in contents(folder) if contents(folder)[key] != before[key]} >= {
+        f"images/{images[1].key}-depth.jpg"
+    }
+    drawn = {path.parent.name + "/" + path.name for path, inode in inodes.items() if path.stat().st_ino != inode}
+    assert {name[:13] for name in drawn} == {images[1].key, images[3].key}
+
+
+@pytest.mark.parametrize(
+    "content", ["", "[]", '{"000001/000000": 3}', '{"000001/000000": ["x", ["../../etc/passwd"]]}']
+)
+def test_a_damaged_memory_of_what_was_drawn_is_forgotten(small_dataset: Path, tmp_path: Path, content: str) -> None:
+    folder = write_preview(small_dataset, tmp_path / "pages", limit=1).parent
+    before = contents(folder)
+    (folder / "drawn.json").write_text(content)
+    write_preview(small_dataset, folder, limit=1)
+    assert contents(folder) == before
+
+
+def test_the_first_page_opens_while_the_rest_is_drawn(
+    small_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("synthetless.preview.write.FIRST_IMAGES", 2)
+    to, opened = tmp_path / "pages", list[tuple[int, int]]()
+
+    def opens(page: Path) -> None:
+        opened.append((len(list(to.glob("thumbnails/*/*"))), len(_index(page)["images"])))
+
+    write_preview(small_dataset, to, opens=opens)
+    assert opened == [(2, 6)]
+    assert contents(to) == contents(write_preview(small_dataset, tmp_path / "other", limit=6).parent)
+    write_preview(small_dataset, to, opens=opens)
+    assert len(opened) == 1
+
+    def interrupted(page: Path) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_preview(small_dataset, tmp_path / "left", opens=interrupted)
+    assert not (tmp_path / "left").exists()
 
 
 def test_a_damaged_dataset_leaves_the_former_preview(small_dataset: Path, tmp_path: Path) -> None:
@@ -191,6 +259,10 @@ def _index(page: Path) -> dict[str, list]:
 def _detail(page: Path, key: str) -> dict:
     text = (page.parent / "data" / f"{key}.js").read_text()
     return json.loads(text.split(", ", 1)[1].removesuffix(");\n"))
+
+
+def _small(path: Path) -> np.ndarray:
+    return cv2.resize(decode_rgb(read_bytes(path)), (16, 12), interpolation=cv2.INTER_AREA).astype(np.float64)
 
 
 def _filled(path: str, shape: tuple[int, ...]) -> np.ndarray:

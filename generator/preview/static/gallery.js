@@ -6,13 +6,10 @@ const synthetless = {
   index: { images: [], classes: [] },
   found: [], // keys of the images that the filters let through
 
-  // A class's colour, the same as in the contact sheet: neighbouring ids are far apart.
-  colour: (id) => `hsl(${Math.floor(((id * 0.618034) % 1) * 180) * 2} 100% 61%)`,
+  classes: new Map(), // {id, name, colour} by object id
 
-  className(id) {
-    const known = this.index.classes.find((entry) => entry.id === id);
-    return known ? known.name : String(id);
-  },
+  colour: (id) => synthetless.classes.get(id).colour,
+  className: (id) => synthetless.classes.get(id).name,
 
   // An element with attributes and children; text is always text.
   element(name, attributes = {}, ...children) {
@@ -44,6 +41,7 @@ const synthetless = {
   },
 
   start() {
+    this.classes = new Map(this.index.classes.map((entry) => [entry.id, entry]));
     this.gallery.prepare();
     this.viewer.prepare();
     addEventListener("hashchange", () => this.show());
@@ -70,6 +68,7 @@ synthetless.gallery = {
     this.form = document.getElementById("filters");
     this.tiles = document.getElementById("tiles");
     this.size = document.getElementById("page-size");
+    this.legend();
     for (const { id, name } of index.classes) this.form.elements.class.append(element("option", { value: id }, name));
     const largest = index.images.reduce((most, [, flat]) => {
       for (let at = 1; at < flat.length; at += this.PER_INSTANCE) most = Math.max(most, flat[at]);
@@ -92,6 +91,23 @@ synthetless.gallery = {
     document.getElementById("help-button").addEventListener("click", () => help.showModal());
   },
 
+  // What the dots mean; a click shows the images with that class.
+  legend() {
+    const { element, index, colour } = synthetless;
+    const entries = index.classes.map(({ id, name }) => {
+      const dot = element("span", { class: "dot" });
+      dot.style.backgroundColor = colour(id);
+      const button = element("button", { type: "button", "data-class": id }, dot, name);
+      button.addEventListener("click", () => {
+        const chosen = synthetless.state().get("class") === String(id);
+        synthetless.change({ class: chosen ? "" : String(id), page: "" });
+      });
+      return button;
+    });
+    document.getElementById("classes").open = entries.length <= 12;
+    document.querySelector("#classes div").replaceChildren(...entries);
+  },
+
   turn(page) {
     synthetless.change({ page: String(Math.min(Math.max(1, page || 1), this.pages)) });
     scrollTo(0, 0);
@@ -103,6 +119,9 @@ synthetless.gallery = {
     for (const name of this.FIELDS) {
       const field = this.form.elements[name];
       if (field !== document.activeElement) field.value = state.get(name) ?? "";
+    }
+    for (const button of document.querySelectorAll("#classes button")) {
+      button.setAttribute("aria-pressed", String(button.dataset.class === state.get("class")));
     }
     const number = (name, otherwise) => (state.has(name) ? Number(state.get(name)) : otherwise);
     const wanted = { object: number("class", null), regressor: number("regressor", null) };
@@ -152,15 +171,16 @@ synthetless.gallery = {
   tile(key, flat) {
     const { element, colour, className } = synthetless;
     const ids = flat.filter((_, at) => at % this.PER_INSTANCE === 0);
-    const names = ids.map((id) => className.call(synthetless, id)).join(", ");
+    const names = ids.map((id) => className(id)).join(", ");
     const dots = ids.map((id) => {
-      const dot = element("span", { class: "dot", title: className.call(synthetless, id) });
+      const dot = element("span", { class: "dot", title: className(id) });
       dot.style.backgroundColor = colour(id);
       return dot;
     });
     const picture = element("img", {
       src: `thumbnails/${key}.jpg`, loading: "lazy", decoding: "async", alt: `image ${key}: objects ${names || "none"}`,
     });
+    picture.addEventListener("error", () => picture.parentElement.classList.add("undrawn"));
     const caption = element("span", { class: "caption" }, element("span", {}, key), element("span", {}, ...dots));
     const link = element("a", { class: "tile", href: synthetless.address({ image: key }), "data-key": key }, picture, caption);
     return element("div", { role: "listitem" }, link);

@@ -7,9 +7,9 @@ synthetless.arrived = (key, detail) => synthetless.viewer.arrived(key, detail);
 synthetless.viewer = {
   OVERLAYS: [
     ["visible", "Visible masks"],
-    ["amodal", "Amodal outlines"],
-    ["true-box", "3D boxes, true pose"],
-    ["true-axes", "Axes, true pose"],
+    ["amodal", "Amodal outlines (dashed)"],
+    ["true-box", "3D boxes, true pose (white)"],
+    ["true-axes", "Axes, true pose (dashed)"],
     ["canonical-box", "3D boxes, canonical pose"],
     ["canonical-axes", "Axes, canonical pose"],
     ["ids", "Object ids"],
@@ -29,10 +29,13 @@ synthetless.viewer = {
   prepare() {
     const { element } = synthetless;
     this.drawing = document.getElementById("drawing");
+    synthetless.zoom.prepare(this.drawing);
     const boxes = this.OVERLAYS.map(([name, title], at) => {
       const box = element("input", { type: "checkbox", name, value: name });
       box.addEventListener("change", () => this.toggle(name));
-      return element("label", {}, box, element("span", {}, title), element("kbd", { "aria-hidden": "true" }, this.KEYS[at]));
+      const axes = name.endsWith("axes") ? ["x", "y", "z"].map((axis) => element("b", { class: `${axis}-axis` }, axis)) : [];
+      const words = element("span", {}, title, ...axes);
+      return element("label", {}, box, words, element("kbd", { "aria-hidden": "true" }, this.KEYS[at]));
     });
     document.getElementById("overlays").append(...boxes);
     document.getElementById("back").addEventListener("click", () => this.close());
@@ -50,6 +53,7 @@ synthetless.viewer = {
   },
 
   open(key) {
+    if (key !== this.current) this.fitted = false;
     this.last = key;
     this.current = key;
     const at = synthetless.found.indexOf(key);
@@ -68,7 +72,8 @@ synthetless.viewer = {
     script.addEventListener("load", () => script.remove());
     script.addEventListener("error", () => {
       script.remove();
-      document.getElementById("legend").textContent = `data/${key}.js is missing: make the preview again.`;
+      this.drawing.replaceChildren();
+      this.tell(`data/${key}.js is missing. While the preview is being made, load this page again later; else make it again.`);
     });
     document.head.append(script);
   },
@@ -88,15 +93,23 @@ synthetless.viewer = {
     if (next !== undefined) synthetless.change({ image: next });
   },
 
+  tell(words) {
+    document.getElementById("legend").textContent = words;
+  },
+
   draw(detail) {
     const names = Object.keys(detail.views);
     const asked = synthetless.state().get("view");
     const view = names.includes(asked) ? asked : names[0];
     this.drawViews(names, view);
     const [width, height] = detail.size;
-    this.drawing.setAttribute("viewBox", `-0.5 -0.5 ${width} ${height}`); // pixel (i, j) has its centre at (i, j)
+    if (!this.fitted) synthetless.zoom.of(width, height);
+    this.fitted = true;
     this.drawing.style.setProperty("--ratio", width / height);
+    this.drawing.style.setProperty("--letters", `${Math.max(width, height) / 42}px`);
     const picture = view && svg("image", { href: detail.views[view], x: -0.5, y: -0.5, width, height });
+    if (picture) picture.addEventListener("error", () => this.tell(
+      `${decodeURI(detail.views[view])} is missing. These pages show the dataset's own pictures; synthetless preview --copy makes a folder that can be moved.`));
     const chosen = this.overlays();
     for (const box of document.querySelectorAll("#overlays input")) {
       box.checked = chosen.has(box.name);
@@ -106,22 +119,22 @@ synthetless.viewer = {
     const layers = [...this.OVERLAYS.map(([name]) => name).filter((name) => !this.WORDS.includes(name)), "words"];
     const groups = layers
       .filter((name) => (name === "words" ? words.length : chosen.has(name)))
-      .map((name) => svg("g", { "data-overlay": name }, ...detail.instances.flatMap((instance) => this.layer(name, instance, words, detail.size))));
+      .map((name) => svg("g", { "data-overlay": name }, ...detail.instances.flatMap((instance) => this.layer(name, instance, words))));
     this.drawing.replaceChildren(...(picture ? [picture] : []), ...groups);
     const legends = {
       depth: () => `Depth: brightest at ${detail.depth_mm[0]} mm, darkest from ${detail.depth_mm[1]} mm on; black where there is none.`,
       normals: () => "Normals in the camera's frame: x red, y green, z blue; mid-grey is zero.",
     };
-    document.getElementById("legend").textContent = view in legends ? legends[view]() : "";
+    this.tell(view in legends ? legends[view]() : "");
     this.drawTable(detail);
     this.drawSections(detail.sections);
   },
 
   // The shapes of one instance in one layer.
-  layer(name, instance, words, size) {
+  layer(name, instance, words) {
     const style = `--class: ${synthetless.colour(instance.obj)}`;
     const common = { "data-gt": instance.gt, style };
-    if (name === "words") return this.words(instance, words, size);
+    if (name === "words") return this.words(instance, words);
     if (name === "visible" || name === "amodal") {
       const d = instance.outlines[name];
       return d ? [svg("path", { ...common, d, class: name })] : [];
@@ -133,12 +146,12 @@ synthetless.viewer = {
     return lines(instance[pose], pose, what);
   },
 
-  words(instance, chosen, size) {
+  words(instance, chosen) {
     if (!instance.place.length) return [];
     const margin = instance.margin >= 180 ? "no jump" : `${instance.margin.toFixed(1)}°`;
     const texts = { ids: synthetless.className(instance.obj), regressor: `r${instance.regressor}`, margin };
     const [x, y] = instance.place;
-    const text = svg("text", { x, y, "font-size": Math.max(...size) / 42, "data-gt": instance.gt });
+    const text = svg("text", { x, y, "data-gt": instance.gt });
     text.textContent = chosen.map((name) => texts[name]).join(" · ");
     return [text];
   },
@@ -217,6 +230,9 @@ synthetless.viewer = {
       ArrowLeft: () => this.step(-1),
       ArrowRight: () => this.step(1),
       0: () => synthetless.change({ overlays: " " }),
+      "+": () => synthetless.zoom.by(1.5),
+      "-": () => synthetless.zoom.by(1 / 1.5),
+      f: () => synthetless.zoom.fit(),
       ...Object.fromEntries([...views, ...toggles]),
     };
     if (event.key in actions) {
