@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.resources import as_file, files
 from itertools import groupby
 from pathlib import Path
@@ -90,15 +91,33 @@ def write_pages(folder: Path, title: str, split: str, images: int) -> None:
             shutil.copyfile(path, folder / name)
 
 
-def write_statistics(folder: Path, title: str, of: Statistics, names: Mapping[int, str]) -> None:
+@dataclass(frozen=True)
+class Summary:
+    """The statistics and their plots as SVG, by name."""
+
+    statistics: Statistics
+    plots: Mapping[str, bytes]
+
+    @classmethod
+    def of(cls, found: Statistics) -> Summary:
+        """Draw them.
+
+        Raises:
+            UserError: matplotlib is not installed.
+        """
+        return cls(found, dict(plots(found)))
+
+
+def write_statistics(folder: Path, title: str, summary: Summary, names: Mapping[int, str]) -> None:
     """Write the page of the statistics, its plots, and the numbers as JSON; ``names`` are the objects', by id.
 
     Raises:
         UserError: as ``write_pages``.
     """
+    of = summary.statistics
     content = json.dumps(of.to_json(), indent=1, allow_nan=False)
     atomic_write(folder / STATISTICS_FILE, f"{content}\n".encode())
-    for name, svg in plots(of):
+    for name, svg in summary.plots.items():
         atomic_write(folder / "plots" / f"{name}.svg", svg)
     ordered = sorted(of.distributions, key=lambda each: _GROUPS.index(each.group))
     groups = [(group, list(members)) for group, members in groupby(ordered, key=lambda each: each.group)]

@@ -25,6 +25,7 @@ from synthetless.io.parallel import processes
 from synthetless.preview.image import Drawn, ImageTask, image_key, write_image
 from synthetless.preview.pages import (
     PAGE_FILE,
+    Summary,
     read_drawn,
     refuse_others,
     write_drawn,
@@ -80,10 +81,10 @@ def write_preview(
     if source.count <= FIRST_IMAGES or (to / PAGE_FILE).exists():
         pages.write(source.count)
     else:
-        pages.write(FIRST_IMAGES)
+        summary = pages.write(FIRST_IMAGES)
         try:
             opens(to / PAGE_FILE)
-            pages.write(source.count)
+            pages.write(source.count, summary)
         except BaseException:
             pages.remove()
             raise
@@ -204,16 +205,20 @@ class _Pages:
     copy: bool
     workers: int | None
 
-    def write(self, most: int) -> None:
-        """Write all pages, with the first ``most`` images drawn, in the place of those that stand there."""
+    def write(self, most: int, summary: Summary | None = None) -> Summary:
+        """Write all pages, with the first ``most`` images drawn, in the place of those that stand there.
+
+        The statistics are summed up, which takes seconds, unless they are given; they are returned.
+        """
         source = self.source
         names = {obj_id: class_name(obj_id, info) for obj_id, info in source.infos.items()}
         with atomic_folder(self.to, replace=True) as draft:
             self._write_images(draft, most)
             write_pages(draft, source.title, source.dataset.split, source.count)
-            found = statistics(source.dataset.root, source.dataset.split)
-            write_statistics(draft, source.title, found, names)
+            summary = summary or Summary.of(statistics(source.dataset.root, source.dataset.split))
+            write_statistics(draft, source.title, summary, names)
             refuse_others(self.to)
+        return summary
 
     def remove(self) -> None:
         """Take away pages of which the rest could not be drawn."""
@@ -236,10 +241,9 @@ class _Pages:
         self._write_index(draft, index)
 
     def _task(self, image: Image, spec: ImageSpec | None, draft: Path, former: Mapping[str, Drawn]) -> ImageTask:
-        infos = {each.obj_id: self.source.infos[each.obj_id] for each in image.instances}
-        return ImageTask(
-            image, spec, infos, self.source.size_px, draft, self.to, self.copy, former.get(image_key(image))
-        )
+        source, known = self.source, former.get(image_key(image))
+        infos = {each.obj_id: source.infos[each.obj_id] for each in image.instances}
+        return ImageTask(image, spec, infos, source.symmetries, source.size_px, draft, self.to, self.copy, known)
 
     def _write_index(self, draft: Path, index: list[Any]) -> None:
         found = sorted({obj_id for _, flat in index for obj_id in flat[::4]})

@@ -197,7 +197,7 @@ def test_wheel_keys_drag_and_double_click_zoom(open_page: Any, keys: list[str]) 
     drawing = _css(open_page, "#drawing")[0]
     whole = [-0.5, -0.5, 128.0, 96.0]
     assert box() == whole
-    size = drawing.size["width"]
+    size = int(drawing.size["width"])
     origin = ScrollOrigin.from_element(drawing, -size // 4, 0)
     ActionChains(open_page).scroll_from_origin(origin, 0, -500).perform()
     assert _eventually(open_page, "return document.getElementById('drawing').classList.contains('zoomed')")
@@ -274,11 +274,11 @@ def test_the_statistics_load_and_every_plot_is_there(open_page: Any) -> None:
         open_page, "return [...document.images].every(image => image.complete && image.naturalWidth > 0)"
     )
     assert _css(open_page, "h1")[0].text.split() == HOSTILE_NAME.split()
-    classes = _css(open_page, "#classes")[0]
+    classes = _css(open_page, "#each-class")[0]
     assert classes.get_dom_attribute("open") is None  # six images say little of a class
     assert HOSTILE_OBJECT.split()[0] in classes.get_property("textContent")
     links = [link.get_dom_attribute("href") for link in _css(open_page, ".contents a")]
-    assert links[-1] == "#classes" and all(_css(open_page, link) for link in links)
+    assert links[-1] == "#each-class" and all(_css(open_page, link) for link in links)
 
 
 def test_nothing_asks_the_network(open_page: Any, keys: list[str]) -> None:
