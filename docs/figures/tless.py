@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from synthetless.dataset import Dataset
 from synthetless.dataset.labels import box_corners_mm
-from synthetless.dataset.records import ModelInfo
 from synthetless.dataset.palette import class_color
+from synthetless.dataset.records import ModelInfo
 from synthetless.io import images
 from synthetless.io.files import atomic_write, read_bytes
 from synthetless.preview.image import Segment, axis_lines, box_lines
