@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system-libraries demo test interop learn wheel lint format parts docs bench clean
+.PHONY: help setup system-libraries demo test interop learn notebooks wheel lint format parts docs bench clean
 
 help:  ## this menu
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-18s %s\n", $$1, $$2}'
@@ -34,6 +34,10 @@ interop: setup  ## the exports in trainers' own loaders: Hugging Face datasets, 
 learn: setup  ## torch and what else the learning system needs, and its tests
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[learn]'
 	$(BIN)/pytest tests/learning
+
+notebooks: setup  ## run the notebooks of docs/ (installs Jupyter's kernel)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[notebooks]'
+	$(BIN)/pytest tests/docs/test_notebooks.py
 
 wheel: setup  ## the wheel alone, in fresh environments of every Python from 3.10 to 3.13 that is here
 	.ci/wheel $(BIN)/python

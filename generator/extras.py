@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from contextlib import suppress
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, distribution
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
-from urllib.parse import unquote, urlparse
 
 from synthetless.errors import UserError
 
@@ -103,6 +100,10 @@ else:
 
 def _origin() -> tuple[str, bool]:
     """What pip calls this package where it came from, and whether it was installed as a link to there (PEP 610)."""
+    import json
+    from importlib.metadata import PackageNotFoundError, distribution
+    from urllib.parse import unquote, urlparse
+
     source = Path(__file__).resolve().parents[1]
     with suppress(PackageNotFoundError, ValueError, KeyError):
         record = json.loads(distribution("synthetless").read_text("direct_url.json") or "{}")

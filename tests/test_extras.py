@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def _came_from(url: str | None, monkeypatch: pytest.MonkeyPatch, **record: object) -> None:
     text = None if url is None else json.dumps({"url": url, **record})
-    monkeypatch.setattr(extras, "distribution", lambda _: SimpleNamespace(read_text=lambda _: text))
+    monkeypatch.setattr("importlib.metadata.distribution", lambda _: SimpleNamespace(read_text=lambda _: text))
 
 
 def test_the_command_names_the_clone_the_wheel_or_the_index(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

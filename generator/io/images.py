@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from synthetless.errors import UserError
 from synthetless.extras import MissingExtraError, cv2
-from synthetless.scenes import render
 
 COORDINATE_SCALE_MM = 0.02
 """Object coordinates are stored in steps of this size, so the rounding error is at most 0.01 mm."""
@@ -227,6 +226,8 @@ def read_exr(path: Path) -> NDArray[np.float32]:
     Raises:
         UserError: it is missing or damaged, holds something else, or the OpenEXR package is not installed.
     """
+    from synthetless.scenes import render  # it imports all that a scene has, which few who read images need
+
     if not path.is_file():
         raise UserError(f"{path}: not found")
     try:

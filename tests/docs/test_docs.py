@@ -69,6 +69,7 @@ CHANGED = (
 NOT_RUN = (
     (r"make setup( PYTHON=.*)?", "makes the environment that this test runs in"),
     (r"source \.venv/bin/activate", "a page's commands find the environment's programs already"),
+    (r"docker .*", "needs Docker; see test_docker.py"),
     (r"sudo (make system-libraries|apt-get .*)", "installs packages, as root"),
     (r"sbatch .*", "needs SLURM"),
     (r"ray (start|stop).*|.* --executor ray .*", "would stop every Ray on this machine; see test_cluster.py"),

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-nbformat = pytest.importorskip("nbformat", reason="nbformat is not installed; extra 'dev' has it")
-nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed; extra 'dev' has it")
-pytest.importorskip("ipykernel", reason="ipykernel, which runs notebooks, is not installed; extra 'dev' has it")
+nbformat = pytest.importorskip("nbformat", reason="nbformat is not installed; extra 'notebooks' has it")
+nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed; extra 'notebooks' has it")
+pytest.importorskip("ipykernel", reason="ipykernel, which runs notebooks, is not installed; extra 'notebooks' has it")
 
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "docs" / "notebooks").glob("*.ipynb"))
 
