@@ -131,9 +131,8 @@ class Recipe(SceneSettings):
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """The camera's pinhole model."""
-        camera = self.camera
-        return Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        """The camera's model."""
+        return self.camera.intrinsics
 
 
 @dataclass(frozen=True)
@@ -325,7 +324,8 @@ def _kind(annotation: Any, metadata: Sequence[Any]) -> str:
     if len(arguments) == 2 and arguments[0] is arguments[1] and Ellipsis not in arguments:
         return f"[min, max] in {bounds}"
     if bounds:
-        return ("integer in " if annotation is int else "number in ") + bounds
+        what = f"{len(arguments)} numbers" if arguments else "integer" if annotation is int else "number"
+        return f"{what} in {bounds}"
     if annotation is str or str in arguments:
         return "text"
     return "list"

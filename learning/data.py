@@ -22,6 +22,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from synthetless.annotation.instances import NO_BOX
 from synthetless.dataset.reader import Dataset, Image, read_specs
+from synthetless.dataset.records import projection_of
 from synthetless.errors import UserError
 from synthetless.extras import cv2
 from synthetless.io.images import decode_rgb
@@ -42,6 +43,7 @@ class Sample:
         key: "000001_000042", scene and image.
         pixels: (H, W, 3) uint8 sRGB.
         K: (3, 3) camera matrix.
+        distortion: (5,) of the lens; zeros of a pinhole.
         obj_ids: (N,).
         R_m2c, t_m2c: (N, 3, 3), (N, 3) mm, true poses.
         boxes: (N, 4) float, x1, y1, x2, y2 of the visible part.
@@ -51,6 +53,7 @@ class Sample:
     key: str
     pixels: NDArray[np.uint8]
     K: Floats
+    distortion: Floats
     obj_ids: NDArray[np.int64]
     R_m2c: Floats
     t_m2c: Floats
@@ -72,6 +75,7 @@ def sample_of(image: Image) -> Sample:
         image.key,
         image.rgb(),
         image.K,
+        image.distortion,
         np.array([n.obj_id for n, _ in seen], dtype=np.int64),
         np.array([n.R_m2c for n, _ in seen]).reshape(-1, 3, 3),
         np.array([n.t_m2c for n, _ in seen]).reshape(-1, 3),
@@ -201,17 +205,21 @@ def _sample(key: str, members: Mapping[str, bytes], shard: Path) -> Sample:
     try:
         name = next(name for name in ("rgb.png", "rgb.jpg") if name in members)
         camera, gt, info = (json.loads(members[f"{part}.json"]) for part in ("camera", "gt", "gt_info"))
+        K, distortion = projection_of(camera)
         seen = [(g, i) for g, i in zip(gt, info, strict=True) if tuple(i["bbox_visib"]) != NO_BOX]
         return Sample(
             key,
             decode_rgb(members[name], shard / f"{key}.{name}"),
-            np.array(camera["cam_K"], dtype=np.float64).reshape(3, 3),
+            np.array(K, dtype=np.float64).reshape(3, 3),
+            np.array(distortion),
             np.array([g["obj_id"] for g, _ in seen], dtype=np.int64),
             np.array([g["cam_R_m2c"] for g, _ in seen], dtype=np.float64).reshape(-1, 3, 3),
             np.array([g["cam_t_m2c"] for g, _ in seen], dtype=np.float64).reshape(-1, 3),
             _corners([i["bbox_visib"] for _, i in seen]),
             np.array([i["visib_fract"] for _, i in seen], dtype=np.float64),
         )
+    except UserError as error:
+        raise UserError(f"{shard}: image {key}: {error}") from None
     except (KeyError, StopIteration, TypeError, json.JSONDecodeError) as error:
         raise UserError(f"{shard}: image {key} lacks what is learned from ({error!r})") from None
 
@@ -243,7 +251,7 @@ class SampleBatcher:
         wanted = np.isin(sample.obj_ids, self._ids) & (sample.visib_fract >= self._least)
         classes = np.searchsorted(self._ids, sample.obj_ids[wanted])
         targets = self._maker(sample.obj_ids[wanted], sample.R_m2c[wanted], sample.t_m2c[wanted])
-        corners = targets.corners_px(self._boxes[classes], sample.K)
+        corners = targets.corners_px(self._boxes[classes], sample.K, sample.distortion)
         return Instances(
             torch.from_numpy(sample.boxes[wanted]).float(),
             torch.from_numpy(classes + 1),
@@ -281,7 +289,14 @@ def crops_of(
         min_visib_fract: instances of which less is visible are left out.
         elevation: (N,) degrees, if known.
         wanted: (N,) which instances; all if None.
+
+    Raises:
+        UserError: the image was taken through a lens, which no virtual camera's homography takes out.
     """
+    if sample.distortion.any():
+        raise UserError(
+            f"image {sample.key} has lens distortion; crops are cut from pinhole images, undistort it first"
+        )
     visible = sample.visib_fract >= min_visib_fract
     rows = np.flatnonzero(visible if wanted is None else visible & wanted)
     boxes = sample.boxes[rows]

@@ -18,6 +18,7 @@ from typing_extensions import Self
 
 from synthetless.annotation.instances import Window, image_window
 from synthetless.annotation.raycast import PosedSurface, Rays, Surface
+from synthetless.scenes.lens import project
 from synthetless.scenes.spec import Intrinsics
 
 Floats = NDArray[np.float64]
@@ -85,16 +86,24 @@ class ModelPoints:
         bounds = _length(self._bounding_mm, turned, moved)
         return _least(bounds, lambda number: float(_length(self._hull_mm, turned[number], moved[number])))
 
-    def mspd(self, estimate: RigidPose, truth: RigidPose, K: Floats) -> float:
-        """Largest distance of a projected vertex from its true place, pixels, under the best symmetry."""
+    def mspd(self, estimate: RigidPose, truth: RigidPose, K: Floats, distortion: Floats | None = None) -> float:
+        """Largest distance of a projected vertex from its true place, pixels, under the best symmetry.
+
+        Args:
+            estimate, truth: the poses.
+            K: (3, 3) camera matrix.
+            distortion: (5,) of the lens; None for a pinhole.
+        """
         R, t = self._looks_alike(truth)
         few = self._bounding_mm
-        bounds = _pixel_distance(_project(few, K, *estimate), _project(few, K, R, t))
-        projected = _project(self.vertices_mm, K, *estimate)
-        return _least(
-            bounds,
-            lambda number: float(_pixel_distance(projected, _project(self.vertices_mm, K, R[number], t[number]))),
-        )
+        bounds = _pixel_distance(_projected(few, K, distortion, *estimate), _projected(few, K, distortion, R, t))
+        estimated = _projected(self.vertices_mm, K, distortion, *estimate)
+
+        def exact(number: int) -> float:
+            true = _projected(self.vertices_mm, K, distortion, R[number], t[number])
+            return float(_pixel_distance(estimated, true))
+
+        return _least(bounds, exact)
 
     def _looks_alike(self, pose: RigidPose) -> tuple[Floats, Floats]:
         """Rotations (M, 3, 3) and translations (M, 3) of all poses that look like one."""
@@ -140,12 +149,10 @@ def _length(points_mm: Floats, R: Floats, t: Floats) -> Floats:
     return np.asarray(np.sqrt(np.square(vectors).sum(axis=-1).max(axis=-1)))
 
 
-def _project(points_mm: Floats, K: Floats, R: Floats, t: Floats) -> Floats:
+def _projected(points_mm: Floats, K: Floats, distortion: Floats | None, R: Floats, t: Floats) -> Floats:
     """(..., V, 2) pixels of points (V, 3) under poses (..., 3, 3), (..., 3)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        seen = points_mm @ np.swapaxes(K @ R, -1, -2) + (t @ K.T)[..., None, :]
-        pixels: Floats = seen[..., :2] / seen[..., 2:]
-    return pixels
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return project(points_mm @ np.swapaxes(R, -1, -2) + t[..., None, :], K, distortion)
 
 
 def _pixel_distance(a: Floats, b: Floats) -> Floats:
@@ -224,7 +231,7 @@ def silhouettes_may_overlap(radius_mm: float, estimate: ArrayLike, truth: ArrayL
 
 def _distance(depth_mm: Floats, rays: Rays) -> Floats:
     """Distance from the camera along each ray."""
-    return np.asarray(np.sqrt((rays.x * depth_mm) ** 2 + (rays.y[:, None] * depth_mm) ** 2 + depth_mm**2))
+    return np.asarray(np.sqrt((rays.x * depth_mm) ** 2 + (rays.y * depth_mm) ** 2 + depth_mm**2))
 
 
 def _visible(distance: Floats, of_scene: Floats, delta_mm: float) -> NDArray[np.bool_]:

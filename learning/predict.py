@@ -25,6 +25,8 @@ from synthetless.learning.operators import iou
 from synthetless.learning.results import Estimate, write_results
 from synthetless.learning.solve import solve_pose
 from synthetless.learning.train import Parts, choose_device, read_run
+from synthetless.scenes.lens import project
+from synthetless.scenes.spec import NO_DISTORTION
 
 Floats = NDArray[np.float64]
 
@@ -39,6 +41,7 @@ class Picture:
     Attributes:
         scene_id, im_id, key: which it is.
         K: (3, 3) camera matrix.
+        distortion: (5,) of the lens; zeros of a pinhole.
         read: its pixels (H, W, 3).
         image: of the dataset, if it is of one.
     """
@@ -47,13 +50,14 @@ class Picture:
     im_id: int
     key: str
     K: Floats
+    distortion: Floats
     read: Callable[[], NDArray[np.uint8]]
     image: Image | None = None
 
     @classmethod
     def of(cls, image: Image) -> Picture:
         """An image of a dataset."""
-        return cls(image.scene_id, image.im_id, image.key, image.K, image.rgb, image)
+        return cls(image.scene_id, image.im_id, image.key, image.K, image.distortion, image.rgb, image)
 
     @property
     def instances(self) -> Sequence[Instance]:
@@ -72,7 +76,7 @@ def pictures_of(source: Path, split: str | None = None, camera: Path | None = No
     Args:
         source: the folder.
         split: of the dataset.
-        camera: BOP's camera.json (fx, fy, cx, cy), for a folder of pictures.
+        camera: BOP's camera.json (fx, fy, cx, cy, and of a lens also distortion), for a folder of pictures.
 
     Raises:
         UserError: it is neither; or a camera is missing or damaged.
@@ -82,13 +86,18 @@ def pictures_of(source: Path, split: str | None = None, camera: Path | None = No
     intrinsics = read_json(camera)
     try:
         fx, fy, cx, cy = (float(intrinsics[name]) for name in ("fx", "fy", "cx", "cy"))
+        distortion = np.array(intrinsics.get("distortion", NO_DISTORTION), dtype=np.float64).reshape(5)
     except (KeyError, TypeError, ValueError):
-        raise UserError(f"{camera}: must have the numbers fx, fy, cx and cy, as BOP's camera.json") from None
+        raise UserError(
+            f"{camera}: must have the numbers fx, fy, cx and cy, as BOP's camera.json; distortion, if any, has five"
+        ) from None
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
     paths = sorted(path for path in source.glob("*") if path.suffix.lower() in (".png", ".jpg", ".jpeg"))
     if not paths:
         raise UserError(f"{source}: holds no pictures (*.png, *.jpg)")
-    return [Picture(0, number, path.stem, K, partial(_read_picture, path)) for number, path in enumerate(paths)]
+    return [
+        Picture(0, number, path.stem, K, distortion, partial(_read_picture, path)) for number, path in enumerate(paths)
+    ]
 
 
 def _read_picture(path: Path) -> NDArray[np.uint8]:
@@ -125,7 +134,7 @@ class Predictor:
         for number in range(len(found.scores)):
             obj_id = self.parts.ids[int(found.classes[number]) - 1]
             corners = found.corners_px[number].numpy().astype(np.float64)
-            pose = solve_pose(corners, self.parts.boxes_mm[obj_id], image.K)
+            pose = solve_pose(corners, self.parts.boxes_mm[obj_id], image.K, image.distortion)
             if pose is not None:
                 score = float(found.scores[number])
                 estimates.append(Estimate(image.scene_id, image.im_id, obj_id, score, pose.R_m2c, pose.t_m2c, seconds))
@@ -190,20 +199,20 @@ def draw(pixels: NDArray[np.uint8], image: Picture, estimates: Sequence[Estimate
     canvas = pixels.copy()
     for instance in image.instances:
         if instance.obj_id in parts.boxes_mm:
-            _draw_box(canvas, parts.boxes_mm[instance.obj_id], instance.R_m2c, instance.t_m2c, image.K, _TRUE)
+            _draw_box(canvas, parts.boxes_mm[instance.obj_id], instance.R_m2c, instance.t_m2c, image, _TRUE)
     for estimate in estimates:
         if estimate.score >= _SHOWN:
-            _draw_box(canvas, parts.boxes_mm[estimate.obj_id], estimate.R_m2c, estimate.t_m2c, image.K, _PREDICTED)
+            _draw_box(canvas, parts.boxes_mm[estimate.obj_id], estimate.R_m2c, estimate.t_m2c, image, _PREDICTED)
     return canvas
 
 
 def _draw_box(
-    canvas: NDArray[np.uint8], box_mm: Floats, R: Floats, t: Floats, K: Floats, color: tuple[int, int, int]
+    canvas: NDArray[np.uint8], box_mm: Floats, R: Floats, t: Floats, image: Picture, color: tuple[int, int, int]
 ) -> None:
-    seen = (box_mm @ R.T + t) @ K.T
+    seen = box_mm @ R.T + t
     if (seen[:, 2] <= 0).any():
         return
-    at = np.clip(seen[:, :2] / seen[:, 2:], -1e4, 1e4).round().astype(int)
+    at = np.clip(project(seen, image.K, image.distortion), -1e4, 1e4).round().astype(int)
     for a, b in BOX_EDGES:
         cv2.line(canvas, at[a].tolist(), at[b].tolist(), color, 1, cv2.LINE_AA)
 

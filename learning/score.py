@@ -311,7 +311,7 @@ class _Jury:
         for obj_id in sorted({instance.obj_id for instance in asked}):
             truths = [instance for instance in asked if instance.obj_id == obj_id]
             best = sorted((e for e in estimates if e.obj_id == obj_id), key=lambda e: -e.score)[: len(truths)]
-            matched = self._match(image.K, camera, scene_depth_mm, best, truths)
+            matched = self._match(image, camera, scene_depth_mm, best, truths)
             for i, truth in enumerate(truths):
                 found[truth.gt_id] = {error: hits[i] for error, hits in matched.items()}
         return [
@@ -330,7 +330,7 @@ class _Jury:
 
     def _match(
         self,
-        K: Floats,
+        image: Image,
         camera: Intrinsics,
         scene_depth_mm: Floats | None,
         estimates: Sequence[Estimate],
@@ -351,7 +351,8 @@ class _Jury:
             matched["mssd"] = match(np.reshape(mssd, shape), SHARES)
         if "mspd" in self.judge.errors:
             scale = 640.0 / camera.width
-            mspd = [scale * self._points_of(obj_id).mspd(*pair, K) for row in pairs for pair in row]
+            lens = (image.K, image.distortion)
+            mspd = [scale * self._points_of(obj_id).mspd(*pair, *lens) for row in pairs for pair in row]
             matched["mspd"] = match(np.reshape(mspd, shape), PIXELS)
         return matched
 
@@ -399,8 +400,7 @@ class _Jury:
 
     def _camera(self, image: Image) -> Intrinsics:
         height, width = self._image_size(image)
-        K = image.K
-        return Intrinsics(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+        return image.camera(width, height)
 
     def _image_size(self, image: Image) -> tuple[int, int]:
         """Rows and columns: of the depth image, else of the colour image, else what camera.json says."""

@@ -167,7 +167,7 @@ class CropStream:
         top, left = rng.integers(0, _TEXTURE_PX - size, 2) if size < _TEXTURE_PX else (0, 0)
         picture = texture[top : top + size, left : left + size].astype(np.float64) * rng.uniform(0.5, 1.1)
         normals = posed.normals(faces[hit])
-        towards = np.stack(np.broadcast_arrays(rays.x[None], rays.y[:, None], 1.0), axis=-1)[hit]
+        towards = np.stack(np.broadcast_arrays(rays.x, rays.y, 1.0), axis=-1)[hit]
         towards = -towards / np.linalg.norm(towards, axis=1, keepdims=True)
         normals *= np.sign(np.einsum("ij,ij->i", normals, towards))[:, None]
         picture[hit] = _shade(rng, normals, towards)

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from synthetless.dataset.reader import Instance
 from synthetless.errors import UserError
+from synthetless.scenes.lens import project
 from synthetless.symmetry import CanonicalMap, SymmetryTable
 from synthetless.symmetry.quaternions import Floats, minimal, normalise, to_matrix
 
@@ -56,11 +57,10 @@ class PoseTargets:
     n_regressors: Integers
     margin_deg: Floats
 
-    def corners_px(self, boxes_mm: Floats, K: Floats) -> Floats:
-        """(N, 8, 2) pixels of box corners (N, 8, 3) mm under cameras (N, 3, 3) or (3, 3)."""
+    def corners_px(self, boxes_mm: Floats, K: Floats, distortion: Floats | None = None) -> Floats:
+        """(N, 8, 2) pixels of box corners (N, 8, 3) mm under cameras (N, 3, 3) or (3, 3), and a lens (5,) if any."""
         seen = boxes_mm @ np.swapaxes(self.R_m2c, 1, 2) + self.t_m2c[:, None]
-        pixels = seen @ np.swapaxes(K, -1, -2)
-        return np.asarray(pixels[..., :2] / pixels[..., 2:])
+        return project(seen, K, distortion)
 
 
 class LabelMaker:

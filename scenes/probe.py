@@ -17,7 +17,7 @@ from synthetless.scenes import blender
 from synthetless.scenes.render import BlenderSession
 from synthetless.scenes.sampling import Catalogue, sample_scene
 from synthetless.scenes.settings import ObjectSettings, SceneSettings
-from synthetless.scenes.spec import Intrinsics, Mesh, Pose
+from synthetless.scenes.spec import Mesh, Pose
 
 
 def devices() -> dict[str, Any]:
@@ -37,8 +37,7 @@ def render() -> dict[str, Any]:
     mesh = Mesh(np.array(part.vertices, dtype=np.float64), np.array(part.faces, dtype=np.int32))
     spec = sample_scene(settings, Catalogue({1: 0.06}, {}, ()), seed=0, drop=0)
     hovering = [Pose(item.release.rotation_wxyz, (0.06 * (k - 2), 0.0, 0.04)) for k, item in enumerate(spec.objects)]
-    intrinsics = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    session = BlenderSession({("model", 1): mesh}, intrinsics, settings.render, settings.table)
+    session = BlenderSession({("model", 1): mesh}, camera.intrinsics, settings.render, settings.table)
     began = time.perf_counter()
     with session.scene(spec, hovering) as scene:
         image = scene.render(0)

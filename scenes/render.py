@@ -19,10 +19,12 @@ from synthetless.scenes import blender, camera, lights, materials
 from synthetless.scenes.blender import RenderDevice
 from synthetless.scenes.container import container_mesh
 from synthetless.scenes.environments import load_panorama
+from synthetless.scenes.lens import pinhole_around
 from synthetless.scenes.rotations import matrix
 from synthetless.scenes.settings import RenderSettings, TableSettings
 from synthetless.scenes.spec import AmbientLight, EnvironmentSpec, Intrinsics, Mesh, Pose, Role, SceneSpec
 from synthetless.scenes.textures import PhotoTexture, load_photo, procedural_image, seamless
+from synthetless.scenes.warp import warped
 
 _CREASE_DEG = 30.0
 """Edges sharper than this are shaded as edges."""
@@ -34,7 +36,7 @@ class BlenderSession:
 
     Attributes:
         meshes: every model that may appear, by role and object id.
-        intrinsics: of the camera.
+        intrinsics: of the camera, with its lens.
         settings: of the renderer.
         table: its size, and how photographs are repeated on it.
         photos: folder of the photographs, None if only built-in textures are used.
@@ -57,6 +59,7 @@ class BlenderSession:
     _textures: dict[tuple[Role, int], Any] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
+        self.pinhole = pinhole_around(self.intrinsics)
         self.bpy = blender.start(self.threads, self.device)
         self.configure(self.settings)
 
@@ -101,7 +104,7 @@ class BlenderSession:
             data = self.bpy.data.cameras.new("camera")
             bpy_scene.camera = self.bpy.data.objects.new("camera", data)
             collection.objects.link(bpy_scene.camera)
-            camera.set_intrinsics(bpy_scene, bpy_scene.camera, self.intrinsics)
+            camera.set_intrinsics(bpy_scene, bpy_scene.camera, self.pinhole)
             yield BlenderScene(self, spec, centre_m)
         finally:
             blender.clear(self.bpy, keep={*self._loaded.values(), *self._textures.values()})
@@ -135,7 +138,7 @@ class BlenderSession:
     def _texel_m(self, spec: SceneSpec, centre_m: NDArray[np.float64], rows: int) -> float:
         """Side of a texel of a photograph: as the tile was drawn, or no larger than a pixel where the recipe allows."""
         poses = (camera.extrinsics(view, centre_m) for view in spec.views)
-        pixel_m = min(camera.finest_pixel_m(*pose, self.intrinsics) for pose in poses)
+        pixel_m = min(camera.finest_pixel_m(*pose, self.pinhole) for pose in poses)
         return max(self.table.tile_m[0] / rows, min(spec.plane.tile_m / rows, pixel_m))
 
     def _mesh(self, role: Role, obj_id: int) -> Any:
@@ -176,7 +179,10 @@ class BlenderScene:
             scene.render.filepath = str(file)
             with blender.console_to(self.session.log):
                 self.session.bpy.ops.render.render(write_still=True)
-            return read_exr(file)
+            light = read_exr(file)
+        if self.session.pinhole is self.session.intrinsics:
+            return light
+        return warped(light, self.session.intrinsics)
 
 
 def read_exr(file: Path) -> NDArray[np.float32]:

@@ -9,9 +9,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, GetCoreSchemaHandler, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 from typing_extensions import Self
+
+from synthetless.scenes.lens import fault
+from synthetless.scenes.spec import NO_DISTORTION, Coefficients, Intrinsics
 
 FloatRange = tuple[float, float]
 IntRange = tuple[int, int]
@@ -188,6 +200,8 @@ class CameraSettings(Settings):
     """Horizontal principal point."""
     cy: Annotated[float, Bounds(-100000, 100000, "px")] = 199.5
     """Vertical principal point."""
+    distortion: Annotated[Coefficients, Bounds(-100, 100)] = NO_DISTORTION
+    """Of the lens: k1, k2, p1, p2, k3, Brown-Conrady in OpenCV's order; zeros are a pinhole."""
     distance_m: Annotated[FloatRange, Bounds(0.05, 20, "m")] = (0.6, 1.4)
     """Distance from the point aimed at."""
     elevation_deg: Annotated[FloatRange, Bounds(1, 90, "deg")] = (10.0, 89.0)
@@ -200,6 +214,19 @@ class CameraSettings(Settings):
     """The camera aims at the centre of the settled objects, off by up to this along the table."""
     views_per_drop: Annotated[int, Bounds(1, 1000, "views")] = 1
     """Images taken of one drop from different viewpoints."""
+
+    @field_validator("distortion")
+    @classmethod
+    def _refuse_folds(cls, given: Coefficients, others: ValidationInfo) -> Coefficients:
+        pinhole: dict[str, Any] = {name: others.data.get(name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+        if None not in pinhole.values() and (found := fault(Intrinsics(**pinhole, distortion=given))):
+            raise PydanticCustomError("distortion", "{fault}", {"fault": found})
+        return given
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """The camera's model."""
+        return Intrinsics(self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion)
 
 
 class RoomSettings(Settings):

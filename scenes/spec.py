@@ -18,6 +18,9 @@ Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Role = Literal["model", "distractor"]
 ContainerKind = Literal["box", "tray"]
+Coefficients = tuple[float, float, float, float, float]
+"""Of a lens, k1, k2, p1, p2, k3: Brown-Conrady in OpenCV's order; see ``scenes/lens.py``."""
+NO_DISTORTION: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -248,9 +251,10 @@ class SensorSpec:
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole camera without skew: image size, focal lengths and principal point, all in pixels.
+    """A camera without skew: image size, focal lengths and principal point, all in pixels, and its lens.
 
-    The centre of the pixel in column i and row j is (u, v) = (i, j), as in OpenCV and BOP.
+    The centre of the pixel in column i and row j is (u, v) = (i, j), as in OpenCV and BOP. Without distortion it is a
+    pinhole.
     """
 
     width: int
@@ -259,6 +263,7 @@ class Intrinsics:
     fy: float
     cx: float
     cy: float
+    distortion: Coefficients = NO_DISTORTION
 
 
 @dataclass(frozen=True)

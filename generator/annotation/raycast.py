@@ -2,13 +2,15 @@
 
 Rays through the pixels' centres, (u, v) = (i, j), are cast at each mesh in its own frame, inside the window that its
 convex hull projects to, beyond the border too: that gives the truncated part of a silhouette. Embree finds the
-triangle, double precision the point on it. The table is intersected in closed form.
+triangle, double precision the point on it. The table is intersected in closed form. A lens bends no more than the rays:
+each leads through the point of the plane z = 1 that is seen at the pixel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -30,7 +32,8 @@ from synthetless.annotation.instances import (
 )
 from synthetless.errors import UserError
 from synthetless.extras import LazyModule
-from synthetless.scenes.spec import Intrinsics
+from synthetless.scenes.lens import directions, distorted, reach
+from synthetless.scenes.spec import NO_DISTORTION, Intrinsics
 
 if TYPE_CHECKING:
     from embreex import mesh_construction, rtcore, rtcore_scene
@@ -46,6 +49,9 @@ MISS = -1
 """Triangle number of a ray that meets nothing."""
 
 _START_MARGIN_MM = 1.0
+_NOWHERE = 1e9
+"""For x and y of a pixel, outside the image, at which the lens shows nothing: such a ray meets nothing."""
+_EDGE_SAMPLES = 33
 _FAR_OUTSIDE_PX = 1e9
 _NO_HEIGHT = 1e-9
 """A triangle this flat, as a share of its longest edge, has no normal in double precision, and no ray can hit it."""
@@ -55,7 +61,12 @@ _EDGE_ON = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """The viewing rays of a window of pixels, up to z = 1: (x[i], y[j], 1) in the camera frame."""
+    """The viewing rays (x, y, 1) of a window of pixels, up to z = 1, camera frame.
+
+    Attributes:
+        window: the pixels.
+        x, y: of shapes that broadcast to the window's: (1, w) and (h, 1) of a pinhole, (h, w) behind a lens.
+    """
 
     window: Window
     x: NDArray[np.float64]
@@ -64,24 +75,41 @@ class Rays:
     @classmethod
     def through(cls, camera: Intrinsics, window: Window) -> Rays:
         """The rays through the pixels' centres, (u, v) = (i, j)."""
-        x = (np.arange(window.left, window.right) - camera.cx) / camera.fx
-        y = (np.arange(window.top, window.bottom) - camera.cy) / camera.fy
-        return cls(window, x, y)
+        image = image_window(camera)
+        if camera.distortion != NO_DISTORTION and image.intersection(window) == window:
+            rays, crop = _image_rays(camera), window.slices_in(image)
+            return cls(window, rays.x[crop], rays.y[crop])
+        x, y = directions(camera, np.arange(window.left, window.right), np.arange(window.top, window.bottom))
+        return cls(window, np.where(np.isnan(x), _NOWHERE, x), np.where(np.isnan(y), _NOWHERE, y))
+
+    @property
+    def is_grid(self) -> bool:
+        """Whether they are those of a pinhole: straight rows and columns."""
+        return self.x.shape[0] == self.y.shape[1] == 1
 
     @property
     def lengths(self) -> NDArray[np.float64]:
         """(h, w) distance from the camera to z = 1 along each ray."""
-        lengths: NDArray[np.float64] = np.sqrt(self.x**2 + (self.y**2 + 1.0)[:, None])
+        lengths: NDArray[np.float64] = np.sqrt(self.x**2 + (self.y**2 + 1.0))
         return lengths
 
     def in_model_frame(self, R_m2c: NDArray[np.float64]) -> NDArray[np.float64]:
         """(h, w, 3) all directions."""
-        directions: NDArray[np.float64] = self.x[:, None] * R_m2c[0] + (self.y[:, None] * R_m2c[1] + R_m2c[2])[:, None]
-        return directions
+        all_of_them: NDArray[np.float64] = self.x[..., None] * R_m2c[0] + (self.y[..., None] * R_m2c[1] + R_m2c[2])
+        return all_of_them
 
     def at(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float64]:
         """(N, 3) directions of single pixels, camera frame."""
-        return np.stack([self.x[columns], self.y[rows], np.ones(len(rows))], axis=1)
+        x, y = (np.broadcast_to(of, self.window.shape)[rows, columns] for of in (self.x, self.y))
+        return np.stack([x, y, np.ones(len(rows))], axis=1)
+
+
+@lru_cache(maxsize=2)
+def _image_rays(camera: Intrinsics) -> Rays:
+    """All rays of an image behind a lens: undistorting them takes longer than casting them."""
+    x, y = directions(camera, np.arange(camera.width), np.arange(camera.height))
+    x.flags.writeable = y.flags.writeable = False
+    return Rays(image_window(camera), x, y)
 
 
 class Surface:
@@ -163,6 +191,8 @@ class PosedSurface:
             return Window(0, 0, 0, 0)
         u = camera.fx * points[:, 0] / points[:, 2] + camera.cx
         v = camera.fy * points[:, 1] / points[:, 2] + camera.cy
+        if camera.distortion != NO_DISTORTION:
+            u, v = _behind_lens(camera, u, v)
         bounds = np.clip([u.min(), v.min(), u.max(), v.max()], -_FAR_OUTSIDE_PX, _FAR_OUTSIDE_PX)
         left, top, right, bottom = (int(bound) for bound in [*np.floor(bounds[:2]), *np.ceil(bounds[2:])])
         return Window(left, top, right + 1, bottom + 1)
@@ -226,6 +256,30 @@ class PosedSurface:
 
     def _to_camera(self, centered_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         return centered_mm @ self.R_m2c.T + self.t_center
+
+
+def _behind_lens(
+    camera: Intrinsics, u: NDArray[np.float64], v: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixels whose bounding box holds all that a lens shows of the bounding box of a pinhole's pixels.
+
+    What a continuous mapping makes of a region is bounded by what it makes of its border: here the box's edges, where
+    the lens shows them, else the edge of what it shows. Between two samples the border strays less than they are apart.
+    """
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    (left, right), (top, bottom) = (x.min(), x.max()), (y.min(), y.max())
+    border = np.linspace(
+        [[left, top], [right, top], [right, bottom], [left, bottom]],
+        [[right, top], [right, bottom], [left, bottom], [left, top]],
+        _EDGE_SAMPLES,
+    )
+    points = border.transpose(1, 0, 2).reshape(-1, 2)
+    limit = reach(camera.distortion)
+    points = points * np.minimum(1.0, limit / np.maximum(np.linalg.norm(points, axis=1), 1e-300))[:, None]
+    shown = distorted(points, camera.distortion) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    apart = np.abs(np.diff(shown, axis=0)).max()
+    around = np.concatenate([shown - apart, shown + apart])
+    return around[:, 0], around[:, 1]
 
 
 def pixels_where(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -306,10 +360,11 @@ class Plane:
         up = self.R_w2c[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             z: NDArray[np.float64] = (up @ self.t_w2c) / _along(up, rays.x, rays.y)
-            # What a window shows of the plane is convex, and so is the table: with the corners all of it is there.
-            ends = [0, -1]
-            if z.size and self._is_met(rays.x[ends], rays.y[ends], z[np.ix_(ends, ends)], _SURELY_MM).all():
-                return z
+            # What a pinhole's window shows of the plane is convex, and so is the table: the corners tell of all of it.
+            if z.size and rays.is_grid:
+                corners = z[np.ix_([0, -1], [0, -1])]
+                if self._is_met(rays.x[:, [0, -1]], rays.y[[0, -1]], corners, _SURELY_MM).all():
+                    return z
             return np.where(self._is_met(rays.x, rays.y, z), z, np.inf)
 
     def _is_met(
@@ -354,7 +409,7 @@ class RayCaster:
         """Measure one image. Of surfaces at exactly the same depth the first instance is seen, the table last.
 
         Args:
-            camera: the pinhole.
+            camera: its pinhole and lens.
             plane: the table, or None.
             instances: what gets labels.
             occluders: what hides, but gets none.
@@ -512,8 +567,8 @@ class _NearestSurface:
 
 
 def _along(axis: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(h, w) component of the rays (x, y, 1) of a grid along an axis of the camera frame."""
-    component: NDArray[np.float64] = x * axis[0] + (y * axis[1] + axis[2])[:, None]
+    """(h, w) component of rays (x, y, 1) along an axis of the camera frame."""
+    component: NDArray[np.float64] = x * axis[0] + (y * axis[1] + axis[2])
     return component
 
 

@@ -33,7 +33,7 @@ from synthetless.dataset.layout import (
     find_models_folder,
     scene_folders,
 )
-from synthetless.dataset.reader import Image, Scene, digest, read_recipe, read_specs
+from synthetless.dataset.reader import Image, Scene, digest, intrinsics_of, read_recipe, read_specs
 from synthetless.dataset.records import AmbiguityEntry, ImageSpec
 from synthetless.dataset.relabel import adopt, relabel
 from synthetless.errors import UserError
@@ -370,8 +370,7 @@ def see_images(source: AmbiguitySource, scene: Scene, numbers: Sequence[int]) ->
         if not any(quasi):
             yield [None] * len(bodies)
             continue
-        K = poses.cameras[number]
-        camera = Intrinsics(*size, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2])
+        camera = intrinsics_of(poses.cameras[number], poses.lenses[number], *size)
         plane, unlabelled = _surroundings(source, scene, number, specs.get(int(poses.image_ids[number])))
         depth_mm = _depth_image(source, scene.image(number), size)
         yield [

@@ -17,6 +17,7 @@ from synthetless.dataset.records import CameraEntry, CanonicalEntry, GtEntry, Mo
 from synthetless.errors import UserError
 from synthetless.io.files import is_locked
 from synthetless.io.models import box_corners
+from synthetless.scenes.lens import project
 from synthetless.symmetry import CanonicalMap, CanonicalPoses, SymmetryTable
 
 Floats = NDArray[np.float64]
@@ -54,12 +55,12 @@ def label_scene(
         raise ValueError(f"objects {sorted(found - wanted)} are not to be labelled, and there are no stored labels")
     kept = [] if stored is None else [label for im_id in scene_gt for label in stored[im_id]]
     labels = dict(enumerate(kept))
-    K = poses.K
+    K, distortion = poses.K, poses.distortion
     for obj_id in sorted(wanted):
         corners_mm = _corners_of(obj_id, models_info)
         rows = np.flatnonzero(poses.obj_ids == obj_id)
         canonical = _canonical(poses, rows, table.canonical_map(obj_id))
-        corners_px = project(K[rows], canonical, corners_mm)
+        corners_px = _projected(K[rows], distortion[rows], canonical, corners_mm)
         labels |= zip(rows.tolist(), _entries(obj_id, canonical, corners_px), strict=True)
     rows_in_turn = iter(range(len(poses.obj_ids)))
     return {im_id: [labels[next(rows_in_turn)] for _ in entries] for im_id, entries in scene_gt.items()}
@@ -159,22 +160,14 @@ def box_corners_mm(info: ModelInfo) -> Floats:
     return box_corners(low, low + size)
 
 
-def project(K: Floats, poses: CanonicalPoses, points_mm: Floats) -> Floats:
-    """Pixel coordinates of model points under each pose.
+def _projected(K: Floats, distortion: Floats, poses: CanonicalPoses, points_mm: Floats) -> Floats:
+    """(N, P, 2) pixels (u, v) of model points (P, 3) under N poses, cameras (N, 3, 3) and lenses (N, 5).
 
-    Args:
-        K: (N, 3, 3) camera matrices.
-        poses: N poses, model to camera.
-        points_mm: (P, 3) in the model frame.
-
-    Returns:
-        (N, P, 2) coordinates (u, v). A point in the camera's plane or behind it is projected all the same, as
-        through a pinhole, and may be far away or infinite; infinite ones become 0.
+    A point in the camera's plane or behind it is projected all the same, and may be far away; infinite ones become 0.
     """
     in_camera = np.einsum("nij,pj->npi", poses.R_m2c, points_mm) + poses.t_m2c[:, None]
-    homogeneous = np.einsum("nij,npj->npi", K, in_camera)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pixels: Floats = homogeneous[..., :2] / homogeneous[..., 2:]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        pixels = project(in_camera, K, distortion)
     return np.where(np.isfinite(pixels), pixels, 0.0)
 
 

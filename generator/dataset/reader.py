@@ -45,6 +45,7 @@ from synthetless.dataset.records import (
     GtInfoEntry,
     ImageSpec,
     ambiguity_fault,
+    projection_of,
     read_scene_json,
     validated,
 )
@@ -52,6 +53,7 @@ from synthetless.errors import UserError
 from synthetless.io import images
 from synthetless.io.files import read_bytes, read_json, read_json_lines
 from synthetless.io.models import read_models_info
+from synthetless.scenes.spec import Intrinsics
 from synthetless.symmetry import SymmetryTable
 
 Floats = NDArray[np.float64]
@@ -193,6 +195,8 @@ class Image:
         paths: the scene folder's files.
         im_id: BOP image id in it.
         K: (3, 3) camera matrix, pixels; the centre of pixel (column i, row j) is (u, v) = (i, j).
+        distortion: (5,) of the lens, k1, k2, p1, p2, k3 as in OpenCV, zeros of a pinhole; for ``project`` and
+            ``undistorted_pixels`` of ``synthetless.scenes.lens``.
         depth_scale: millimetres per unit of the depth image.
         R_w2c, t_w2c: (3, 3) and (3,) mm, world to camera; None if the dataset does not say.
         instances: in scene_gt's order.
@@ -201,6 +205,7 @@ class Image:
     paths: ScenePaths
     im_id: int
     K: Floats
+    distortion: Floats
     depth_scale: float
     R_w2c: Floats | None
     t_w2c: Floats | None
@@ -215,6 +220,10 @@ class Image:
     def key(self) -> str:
         """Name of the image in the whole split, as BOP's webdataset has it: "000001_000042"."""
         return f"{self.scene_id:06d}_{self.im_id:06d}"
+
+    def camera(self, width: int, height: int) -> Intrinsics:
+        """Its pinhole and lens, for an image of this size."""
+        return intrinsics_of(self.K, self.distortion, width, height)
 
     def rgb(self) -> NDArray[np.uint8]:
         """(H, W, 3) sRGB."""
@@ -310,6 +319,7 @@ class ScenePoses:
         image_ids: (M,).
         first: (M + 1,) number of each image's first instance, and N.
         cameras: (M, 3, 3) camera matrix of each image, pixels.
+        lenses: (M, 5) distortion of each image, as ``Image.distortion``.
         obj_ids: (N,).
         R_m2c, t_m2c: (N, 3, 3), (N, 3) mm.
     """
@@ -317,6 +327,7 @@ class ScenePoses:
     image_ids: Integers
     first: Integers
     cameras: Floats
+    lenses: Floats
     obj_ids: Integers
     R_m2c: Floats
     t_m2c: Floats
@@ -336,12 +347,13 @@ class ScenePoses:
         image_ids = np.array(list(scene_gt), dtype=np.int64)
         first = np.cumsum([0, *(len(entries) for entries in scene_gt.values())])
         every = [entry for entries in scene_gt.values() for entry in entries]
-        cameras = [scene_camera[im_id] for im_id in scene_gt]
+        cameras, lenses = _projections(scene_gt, scene_camera)
         in_gt = _in_file("scene_gt.json", image_ids, first)
         return cls(
             image_ids,
             first,
             _column(cameras, "cam_K", _in_file("scene_camera.json", image_ids), 9).reshape(-1, 3, 3),
+            lenses,
             _whole_column(every, "obj_id", in_gt),
             _column(every, "cam_R_m2c", in_gt, 9).reshape(-1, 3, 3),
             _column(every, "cam_t_m2c", in_gt, 3),
@@ -351,6 +363,11 @@ class ScenePoses:
     def K(self) -> Floats:
         """(N, 3, 3) camera matrix of each instance's image."""
         return np.repeat(self.cameras, np.diff(self.first), axis=0)
+
+    @property
+    def distortion(self) -> Floats:
+        """(N, 5) distortion of each instance's image."""
+        return np.repeat(self.lenses, np.diff(self.first), axis=0)
 
     def place(self, row: int) -> str:
         """File, image and instance of a row, for messages."""
@@ -450,6 +467,7 @@ class Scene:
             self.paths,
             int(self.poses.image_ids[number]),
             self.poses.cameras[number].copy(),
+            self.poses.lenses[number].copy(),
             float(self.depth_scale[number]),
             None if self.R_w2c is None else self.R_w2c[number].copy(),
             None if self.t_w2c is None else self.t_w2c[number].copy(),
@@ -699,6 +717,27 @@ def read_recipe(root: Path) -> Recipe:
         return Recipe.model_validate(read_json(path).get("recipe"))
     except ValidationError as error:
         raise UserError(f"{path}: its recipe is damaged ({error.errors()[0]['msg']})") from None
+
+
+def intrinsics_of(K: Floats, distortion: Floats, width: int, height: int) -> Intrinsics:
+    """A camera of the matrix K (3, 3) without skew, and a lens (5,)."""
+    k1, k2, p1, p2, k3 = distortion.tolist()
+    return Intrinsics(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], (k1, k2, p1, p2, k3))
+
+
+def _projections(
+    scene_gt: Mapping[int, Any], scene_camera: Mapping[int, CameraEntry]
+) -> tuple[list[dict[str, list[float]]], Floats]:
+    """``cam_K`` of each image, whichever way its camera is described, and (M, 5) its distortion."""
+    matrices, lenses = [], []
+    for im_id in scene_gt:
+        try:
+            K, distortion = projection_of(scene_camera[im_id])
+        except UserError as error:
+            raise UserError(f"scene_camera.json: image {im_id}: {error}") from None
+        matrices.append({"cam_K": K})
+        lenses.append(distortion)
+    return matrices, np.array(lenses, dtype=np.float64).reshape(-1, 5)
 
 
 def _matching(path: Path, gt_path: Path, gts: Mapping[int, Any]) -> dict[int, Any]:

@@ -11,19 +11,19 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, with_config
-from pydantic_core import ErrorDetails
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, with_config
+from pydantic_core import ErrorDetails, PydanticCustomError
 from typing_extensions import NotRequired, TypedDict
 
 from synthetless.annotation.instances import InstanceAnnotation
 from synthetless.errors import UserError
 from synthetless.io.documents import shown
 from synthetless.io.files import read_json, write_json
-from synthetless.scenes.spec import Intrinsics, Pose, SceneSpec, SensorSpec, plain
+from synthetless.scenes.spec import NO_DISTORTION, Coefficients, Intrinsics, Pose, SceneSpec, SensorSpec, plain
 
 MIN_VISIB_FRACT = 0.1
 """Instances with a smaller visible fraction are marked ``ignore`` in scene_gt_coco.json, as bop_toolkit does."""
@@ -46,14 +46,54 @@ PoseList = Annotated[list[Number], Field(min_length=12, max_length=12)]
 Point = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
-@with_config(_EXACT)
-class CameraEntry(TypedDict):
-    """An image in scene_camera.json: camera matrix (row-wise, pixels), world to camera (mm), mm per unit of depth."""
+ModelType = Literal["PinholePlane", "OpenCV"]
 
-    cam_K: Matrix
+
+_N_PARAMETERS: Mapping[str, int] = {"PinholePlane": 4, "OpenCV": 9}
+
+
+def _with_all_parameters(model: Any) -> Any:
+    kind, found = model["projection_model_type"], len(model["projection_params"])
+    if found != _N_PARAMETERS[kind]:
+        text = "cam_model has {found} projection_params; {kind} has {number}"
+        raise PydanticCustomError("camera", text, {"found": found, "kind": kind, "number": _N_PARAMETERS[kind]})
+    return model
+
+
+@with_config(_OPEN)
+class _CameraModelEntry(TypedDict):
+    image_width: Count
+    image_height: Count
+    projection_model_type: Literal["PinholePlane", "OpenCV"]
+    projection_params: list[Number]
+
+
+CameraModelEntry = Annotated[_CameraModelEntry, AfterValidator(_with_all_parameters)]
+"""An image's cam_model, which BOP has since 2024 in the place of cam_K, of one of the two models that are supported.
+
+``projection_params`` are fx, fy, cx, cy, and of OpenCV's model also k1, k2, k3, p1, p2, in this order, which is not
+OpenCV's: https://github.com/facebookresearch/hand_tracking_toolkit, which bop_toolkit projects with.
+"""
+
+
+def _with_a_projection(entry: Any) -> Any:
+    if "cam_K" not in entry and "cam_model" not in entry:
+        raise PydanticCustomError("camera", "cam_K is missing")
+    return entry
+
+
+@with_config(_EXACT)
+class _CameraEntry(TypedDict):
+    cam_K: NotRequired[Matrix]
+    cam_model: NotRequired[CameraModelEntry]
     cam_R_w2c: Matrix
     cam_t_w2c: Vector
     depth_scale: Positive
+
+
+CameraEntry = Annotated[_CameraEntry, AfterValidator(_with_a_projection)]
+"""An image in scene_camera.json: camera matrix (row-wise, pixels) or, of a camera with a lens, its model; world to
+camera (mm); mm per unit of depth."""
 
 
 @with_config(_EXACT)
@@ -112,11 +152,14 @@ class AmbiguityEntry(TypedDict):
 
 
 @with_config(_OPEN)
-class ForeignCameraEntry(TypedDict):
-    """An image in somebody else's scene_camera.json, which may say more, or not where the camera stands."""
-
-    cam_K: Matrix
+class _ForeignCameraEntry(TypedDict):
+    cam_K: NotRequired[Matrix]
+    cam_model: NotRequired[CameraModelEntry]
     depth_scale: NotRequired[Positive]
+
+
+ForeignCameraEntry = Annotated[_ForeignCameraEntry, AfterValidator(_with_a_projection)]
+"""An image in somebody else's scene_camera.json, which may say more, or not where the camera stands."""
 
 
 @with_config(_OPEN)
@@ -208,7 +251,10 @@ class CocoFile(TypedDict):
 
 @with_config(_EXACT)
 class CameraFile(TypedDict):
-    """camera.json: the size and intrinsics of all images, pixels, and mm per unit of depth."""
+    """camera.json: the size and intrinsics of all images, pixels, and mm per unit of depth.
+
+    ``distortion``, which BOP does not have, is k1, k2, p1, p2, k3 of a camera with a lens.
+    """
 
     width: Count
     height: Count
@@ -217,6 +263,7 @@ class CameraFile(TypedDict):
     cx: Number
     cy: Number
     depth_scale: Positive
+    distortion: NotRequired[Annotated[list[Number], Field(min_length=5, max_length=5)]]
 
 
 @dataclass(frozen=True)
@@ -297,6 +344,8 @@ def validated(form: Any, value: Any, path: Path) -> Any:
 
 def _schema_fault(fault: ErrorDetails) -> SchemaFault:
     name = ".".join(str(part) for part in fault["loc"]) or "it"
+    if fault["type"] == "camera":
+        return SchemaFault(fault["loc"], fault["msg"])
     if fault["type"] == "missing":
         return SchemaFault(fault["loc"], f"{name} is missing")
     return SchemaFault(fault["loc"], f"{name} is {shown(fault['input'])}: {fault['msg'][0].lower()}{fault['msg'][1:]}")
@@ -356,6 +405,9 @@ def camera_matrix(intrinsics: Intrinsics) -> NDArray[np.float64]:
 
 def camera_json(intrinsics: Intrinsics, depth_scale: float) -> CameraFile:
     """The content of a dataset's camera.json; ``depth_scale`` is mm per unit of a depth image."""
+    lens: dict[str, Any] = {}
+    if intrinsics.distortion != NO_DISTORTION:
+        lens["distortion"] = list(intrinsics.distortion)
     return {
         "cx": intrinsics.cx,
         "cy": intrinsics.cy,
@@ -364,11 +416,49 @@ def camera_json(intrinsics: Intrinsics, depth_scale: float) -> CameraFile:
         "fy": intrinsics.fy,
         "height": intrinsics.height,
         "width": intrinsics.width,
+        **lens,  # type: ignore[typeddict-item]
     }
 
 
+def camera_model(camera: Intrinsics) -> CameraModelEntry | None:
+    """The ``cam_model`` of a camera with a lens; None of a pinhole, which has ``cam_K``."""
+    if camera.distortion == NO_DISTORTION:
+        return None
+    k1, k2, p1, p2, k3 = camera.distortion
+    parameters = (camera.fx, camera.fy, camera.cx, camera.cy, k1, k2, k3, p1, p2)
+    return {
+        "image_height": camera.height,
+        "image_width": camera.width,
+        "projection_model_type": "OpenCV",
+        "projection_params": [float(value) for value in parameters],
+    }
+
+
+def projection_of(entry: CameraEntry) -> tuple[list[float], Coefficients]:
+    """The camera matrix, 9 numbers row-wise, and the distortion that an image's entry in scene_camera.json has.
+
+    Raises:
+        UserError: it has neither a camera matrix nor a model that is known.
+    """
+    if "cam_K" in entry or "cam_model" not in entry:
+        return entry.get("cam_K"), NO_DISTORTION  # type: ignore[return-value]
+    model: Any = entry["cam_model"]
+    kind = model.get("projection_model_type") if isinstance(model, dict) else None
+    if kind not in _N_PARAMETERS:
+        raise UserError(f"cam_model is {kind or shown(model)}; PinholePlane and OpenCV are supported")
+    if faults := schema_faults(CameraModelEntry, model):
+        raise UserError(f"cam_model: {faults[0].message}")
+    fx, fy, cx, cy, *lens = model["projection_params"]
+    k1, k2, k3, p1, p2 = lens or NO_DISTORTION
+    return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], (k1, k2, p1, p2, k3)
+
+
 def camera_entry(
-    K: NDArray[np.float64], R_w2c: NDArray[np.float64], t_w2c: NDArray[np.float64], depth_scale: float
+    K: NDArray[np.float64],
+    R_w2c: NDArray[np.float64],
+    t_w2c: NDArray[np.float64],
+    depth_scale: float,
+    model: CameraModelEntry | None = None,
 ) -> CameraEntry:
     """An image's entry in scene_camera.json.
 
@@ -377,13 +467,14 @@ def camera_entry(
         R_w2c: (3, 3) rotation, world to camera (OpenCV).
         t_w2c: (3,) translation, world to camera, millimetres.
         depth_scale: millimetres per unit of the depth image.
+        model: of a camera with a lens, as ``camera_model`` gives it: it takes the place of K.
     """
-    return {
-        "cam_K": _floats(K, 9),
+    pose: _CameraEntry = {
         "cam_R_w2c": _floats(R_w2c, 9),
         "cam_t_w2c": _floats(t_w2c, 3),
         "depth_scale": float(depth_scale),
     }
+    return {"cam_K": _floats(K, 9), **pose} if model is None else {"cam_model": model, **pose}
 
 
 def gt_entry(obj_id: int, R_m2c: NDArray[np.float64], t_m2c: NDArray[np.float64]) -> GtEntry:

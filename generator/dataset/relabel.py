@@ -438,8 +438,6 @@ def _label_folder(task: _Task) -> _LabelledScene:
     stored = _stored_labels(paths, gt)
     only = None if stored is None else task.only
     try:
-        if task.foreign:
-            _refuse_camera_models(camera)
         labels = label_scene(gt, camera, _table(task.table), task.models_info, only, stored)
         if task.foreign:
             _refuse_invalid(gt, camera)
@@ -449,15 +447,6 @@ def _label_folder(task: _Task) -> _LabelledScene:
     content = json_bytes(path, {str(im_id): entries for im_id, entries in labels.items()})
     unchanged = path.exists() and content == read_bytes(path)
     return _LabelledScene(paths, None if unchanged else content, len(gt), _diffs(labels, stored, only))
-
-
-def _refuse_camera_models(scene_camera: Mapping[int, object]) -> None:
-    for im_id, entry in scene_camera.items():
-        if isinstance(entry, dict) and "cam_model" in entry and "cam_K" not in entry:
-            raise UserError(
-                f"scene_camera.json: image {im_id} has cam_model instead of cam_K, as BOP has it since 2024; only "
-                "pinhole cameras are supported"
-            )
 
 
 def _refuse_invalid(scene_gt: Mapping[int, object], scene_camera: Mapping[int, object]) -> None:

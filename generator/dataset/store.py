@@ -110,12 +110,13 @@ def image_record(
     exposure_gain: float,
 ) -> ImageRecord:
     """The record of an image; arguments as for ``FinishedImage.of``."""
-    K, scale = records.camera_matrix(recipe.intrinsics), recipe.encoding.depth_scale
+    camera, scale = recipe.intrinsics, recipe.encoding.depth_scale
+    K, model = records.camera_matrix(camera), records.camera_model(camera)
     instances = annotated.image.instances
     sensor = planned_sensor(recipe, plan)
     spec = ImageSpec(plan.im_id, plan.view, exposure_gain, annotated.numbers, scene, tuple(settled), sensor)
     return {
-        "camera": records.camera_entry(K, annotated.R_w2c, annotated.t_w2c, scale),
+        "camera": records.camera_entry(K, annotated.R_w2c, annotated.t_w2c, scale, model),
         "gt": [records.gt_entry(model.obj_id, model.R_m2c, model.t_m2c) for model in annotated.models],
         "gt_info": [records.gt_info_entry(instance) for instance in instances],
         "coco": records.coco_annotations(plan.im_id, [model.obj_id for model in annotated.models], instances),

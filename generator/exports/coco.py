@@ -19,6 +19,7 @@ from typing_extensions import NotRequired, TypedDict
 
 from synthetless.dataset.labels import refuse_half_labelled
 from synthetless.dataset.layout import ScenePaths, find_split, refuse_target, scene_ids
+from synthetless.dataset.records import CameraModelEntry
 from synthetless.errors import UserError
 from synthetless.exports.annotated import (
     AnnotatedImage,
@@ -49,7 +50,8 @@ class ExportedImage(TypedDict):
     height: int
     scene_id: int
     im_id: int
-    cam_K: list[float]
+    cam_K: NotRequired[list[float]]
+    cam_model: NotRequired[CameraModelEntry]
     license: NotRequired[int]
 
 
@@ -168,15 +170,20 @@ def _refuse_others(to: Path) -> None:
 
 def _image(image: AnnotatedImage, image_id: int, scene_id: int, scene: ScenePaths, to: Path) -> ExportedImage:
     path = os.path.relpath(scene.root / image.entry["file_name"], to.parent)
-    return {
+    exported: ExportedImage = {
         "id": image_id,
         "file_name": Path(path).as_posix(),
         "width": image.entry["width"],
         "height": image.entry["height"],
         "scene_id": scene_id,
         "im_id": image.labels.im_id,
-        "cam_K": image.labels.camera["cam_K"],
     }
+    camera = image.labels.camera
+    if "cam_K" in camera:
+        exported["cam_K"] = camera["cam_K"]
+    else:
+        exported["cam_model"] = camera["cam_model"]
+    return exported
 
 
 def _annotation(

@@ -26,6 +26,7 @@ from synthetless.extras import cv2
 from synthetless.io import images
 from synthetless.io.files import atomic_write, link_or_copy, read_bytes
 from synthetless.io.models import BOX_EDGES
+from synthetless.scenes.lens import project
 from synthetless.scenes.spec import EnvironmentSpec, Material, PlaneSpec, RoomSpec, SensorSpec, Vector, View
 from synthetless.scenes.srgb import srgb_from_linear
 from synthetless.scenes.textures import PhotoTexture
@@ -167,7 +168,7 @@ def _draw(task: ImageTask) -> Iterator[str]:
     yield from _file(task, f"thumbnails/{task.key}.jpg", _encode(thumbnail, _THUMBNAIL_PX))
     content = {
         "size": [width, height],
-        "sections": _sections(task.image.K, task.recorded),
+        "sections": _sections(task.image, task.recorded),
         "instances": [_instance(task, instance) for instance in task.image.instances],
         "views": shown,
         "depth_mm": depth_mm,
@@ -197,7 +198,7 @@ def _size_px(task: ImageTask) -> tuple[int, int]:
 def _instance(task: ImageTask, instance: Instance) -> dict[str, Any]:
     label, seen, model = instance.label, instance.visibility, task.infos[instance.obj_id]
     assert label is not None and seen is not None  # see ImageTask
-    paths, K = task.image.paths, task.image.K
+    image, paths = task.image, task.image.paths
     masks = {"visible": paths.mask_visib, "amodal": paths.mask}
     existing = {name: path for name, of in masks.items() if (path := of(instance.im_id, instance.gt_id)).exists()}
     return {
@@ -211,10 +212,10 @@ def _instance(task: ImageTask, instance: Instance) -> dict[str, Any]:
         "place": _place(seen),
         "material": _material(task.recorded, instance.gt_id),
         "outlines": {name: outline(images.decode_mask(read_bytes(path), path)) for name, path in existing.items()},
-        "true": _pose(K, instance.R_m2c, instance.t_m2c, model),
-        "canonical": _pose(K, label.R_m2c, label.t_m2c, model),
+        "true": _pose(image, instance.R_m2c, instance.t_m2c, model),
+        "canonical": _pose(image, label.R_m2c, label.t_m2c, model),
         "cosets": 0 if instance.quasi is None else len(instance.quasi.alike),
-        "alike": [_pose(K, R, t, model) for R, t in _alike(instance, task.symmetries)],
+        "alike": [_pose(image, R, t, model) for R, t in _alike(instance, task.symmetries)],
     }
 
 
@@ -229,10 +230,10 @@ def _alike(instance: Instance, symmetries: SymmetryTable | None) -> Iterator[tup
     yield from ((Rs[number], ts[number]) for number in np.flatnonzero(instance.quasi.alike) if number != true)
 
 
-def _pose(K: Floats, R_m2c: Floats, t_m2c: Floats, model: ModelInfo) -> dict[str, list[Segment]]:
+def _pose(image: Image, R_m2c: Floats, t_m2c: Floats, model: ModelInfo) -> dict[str, list[Segment]]:
     return {
-        "box": box_lines(K, R_m2c, t_m2c, box_corners_mm(model)),
-        "axes": axis_lines(K, R_m2c, t_m2c, 0.5 * float(model["diameter"])),
+        "box": box_lines(image.K, R_m2c, t_m2c, box_corners_mm(model), image.distortion),
+        "axes": axis_lines(image.K, R_m2c, t_m2c, 0.5 * float(model["diameter"]), image.distortion),
     }
 
 
@@ -302,32 +303,37 @@ def _closed(points: NDArray[Any]) -> str:
     return "M" + "L".join(f"{u} {v}" for u, v in points.tolist()) + "Z"
 
 
-def box_lines(K: Floats, R_m2c: Floats, t_m2c: Floats, corners_mm: Floats) -> list[Segment]:
-    """The twelve edges of a box in the image; parts behind the camera are cut off.
+def box_lines(
+    K: Floats, R_m2c: Floats, t_m2c: Floats, corners_mm: Floats, distortion: Floats | None = None
+) -> list[Segment]:
+    """The twelve edges of a box in the image; parts behind the camera are cut off, and a lens bends none of them.
 
     Args:
         K: (3, 3) camera matrix, pixels.
         R_m2c, t_m2c: pose, (3, 3) and (3,) mm.
         corners_mm: (8, 3), in the order of ``labels.box_corners_mm``.
+        distortion: (5,) of the lens; None for a pinhole.
 
     Returns:
         [u, v, u', v'] of each edge that is at least partly before the camera.
     """
-    return _lines(K, corners_mm @ R_m2c.T + t_m2c, BOX_EDGES)
+    return _lines(K, distortion, corners_mm @ R_m2c.T + t_m2c, BOX_EDGES)
 
 
-def axis_lines(K: Floats, R_m2c: Floats, t_m2c: Floats, length_mm: float) -> list[Segment]:
+def axis_lines(
+    K: Floats, R_m2c: Floats, t_m2c: Floats, length_mm: float, distortion: Floats | None = None
+) -> list[Segment]:
     """The model frame's x, y and z axis in the image, each from the origin, as ``box_lines``.
 
     The list is empty unless the origin and all three ends are before the camera: an axis has its colour by its place.
     """
     ends = np.vstack([np.zeros(3), length_mm * np.eye(3)]) @ R_m2c.T + t_m2c
-    return _lines(K, ends, ((0, 1), (0, 2), (0, 3))) if (ends[:, 2] > _NEAR_MM).all() else []
+    return _lines(K, distortion, ends, ((0, 1), (0, 2), (0, 3))) if (ends[:, 2] > _NEAR_MM).all() else []
 
 
-def _lines(K: Floats, points_mm: Floats, pairs: Sequence[tuple[int, int]]) -> list[Segment]:
+def _lines(K: Floats, distortion: Floats | None, points_mm: Floats, pairs: Sequence[tuple[int, int]]) -> list[Segment]:
     clipped = (_before_camera(points_mm[a], points_mm[b]) for a, b in pairs)
-    return [_projected(K, ends) for ends in clipped if ends is not None]
+    return [np.round(project(ends, K, distortion), 1).ravel().tolist() for ends in clipped if ends is not None]
 
 
 def _before_camera(a: Floats, b: Floats) -> Floats | None:
@@ -340,19 +346,16 @@ def _before_camera(a: Floats, b: Floats) -> Floats | None:
     return np.stack([a, b])
 
 
-def _projected(K: Floats, ends_mm: Floats) -> Segment:
-    pixels: Segment = np.round((ends_mm @ K.T)[:, :2] / ends_mm[:, 2:], 1).ravel().tolist()
-    return pixels
-
-
 # The recorded scene in words
 
 
-def _sections(K: Floats, recorded: ImageSpec | None) -> list[Section]:
+def _sections(image: Image, recorded: ImageSpec | None) -> list[Section]:
     """What was drawn for an image: {"title", "rows"}, a row being [name, value] or [name, value, CSS colour]."""
+    K, lens = image.K, image.distortion
     pinhole = [
         ["focal lengths", f"{K[0, 0]:.2f}, {K[1, 1]:.2f} px"],
         ["principal point", f"{K[0, 2]:.2f}, {K[1, 2]:.2f} px"],
+        *([["k1, k2, p1, p2, k3", ", ".join(f"{value:g}" for value in lens)]] if lens.any() else []),
     ]
     if recorded is None:
         return [{"title": "Camera", "rows": pinhole}]

@@ -30,7 +30,6 @@ from synthetless.dataset.records import (
     ForeignGtEntry,
     ForeignGtInfoEntry,
     ModelInfo,
-    read_scene_json,
 )
 from synthetless.extras import cv2
 from synthetless.io.files import read_bytes
@@ -198,12 +197,10 @@ def _read_records(paths: ScenePaths) -> SceneRecords:
 def _read_cameras(path: Path, findings: list[Finding]) -> dict[int, CameraEntry]:
     faults: list[Finding] = []
     cameras = read_entries(path, ForeignCameraEntry, faults)
-    lacking = [finding.image for finding in faults if finding.image is not None and finding.message.startswith("cam_K")]
-    content = read_scene_json(path) if lacking else {}
-    modelled = {im_id for im_id in lacking if isinstance(content[im_id], dict) and "cam_model" in content[im_id]}
+    modelled = {finding.image for finding in faults if finding.message.startswith("cam_model")} - {None}
     if modelled:
-        what = f"{len(modelled)} images have cam_model instead of cam_K, as BOP has it since 2024"
-        findings.append(Finding("schema", path, f"{what}; only pinhole cameras are supported"))
+        what = f"{len(modelled)} images have a cam_model that is not supported"
+        findings.append(Finding("schema", path, f"{what}; PinholePlane and OpenCV, with their parameters, are"))
     findings += [finding for finding in faults if finding.image not in modelled]
     return cameras
 

@@ -28,6 +28,7 @@ from synthetless.dataset.records import (
     ImageSpec,
     ModelInfo,
     camera_matrix,
+    camera_model,
     coco_annotations,
     gt_info_entry,
 )
@@ -141,10 +142,11 @@ def _container_fault(container: ContainerSpec | None) -> str | None:
 def _check_cameras(recipe: Recipe, scene: SceneRecords) -> Iterator[Finding]:
     """scene_camera.json against the recipe; a camera is a rotation and stands above the table."""
     K, scale = camera_matrix(recipe.intrinsics).reshape(9).tolist(), recipe.encoding.depth_scale
-    path = scene.paths.scene_camera
+    model, path = camera_model(recipe.intrinsics), scene.paths.scene_camera
     for im_id, entry in scene.camera.items():
-        if entry["cam_K"] != K:
-            yield Finding("camera", path, f"cam_K is {entry['cam_K']}; the recipe's camera has {K}", im_id)
+        for name, value in (("cam_K", K if model is None else None), ("cam_model", model)):
+            if entry.get(name) != value:
+                yield Finding("camera", path, f"{name} is {entry.get(name)}; the recipe's camera has {value}", im_id)
         if entry["depth_scale"] != scale:
             yield Finding("camera", path, f"depth_scale is {entry['depth_scale']}; the recipe has {scale}", im_id)
         R = np.array(entry["cam_R_w2c"]).reshape(3, 3)

@@ -325,8 +325,8 @@ def _check_camera_file(path: Path, recipe: Recipe) -> Iterator[Finding]:
     yield from bad
     if not bad:
         for key, value in camera_json(recipe.intrinsics, recipe.encoding.depth_scale).items():
-            if content[key] != value:
-                yield Finding("camera", path, f"{key} is {content[key]}; the recipe has {value}")
+            if content.get(key) != value:
+                yield Finding("camera", path, f"{key} is {content.get(key)}; the recipe has {value}")
 
 
 def read_table(root: Path, obj_ids: Collection[int], findings: list[Finding]) -> SymmetryTable | None:

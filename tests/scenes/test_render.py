@@ -21,7 +21,17 @@ from synthetless.scenes.render import BlenderSession
 from synthetless.scenes.rotations import matrix
 from synthetless.scenes.sampling import Catalogue, sample_scene
 from synthetless.scenes.settings import RenderSettings, TableSettings
-from synthetless.scenes.spec import AmbientLight, Intrinsics, Material, Mesh, ObjectSpec, Pose, SceneSpec, View
+from synthetless.scenes.spec import (
+    AmbientLight,
+    Coefficients,
+    Intrinsics,
+    Material,
+    Mesh,
+    ObjectSpec,
+    Pose,
+    SceneSpec,
+    View,
+)
 from synthetless.scenes.textures import ProceduralTexture
 
 pytestmark = pytest.mark.blender
@@ -258,3 +268,39 @@ def test_the_log_takes_what_blender_prints(card_session: BlenderSession, capfd: 
     printed = capfd.readouterr()
     assert printed.out == printed.err == ""
     assert card_session.log.stat().st_size > 0
+
+
+LENSES: dict[str, Coefficients] = {
+    "barrel": (-0.45, 0.15, 0.0, 0.0, 0.0),
+    "pincushion": (0.4, 0.1, 0.0, 0.0, 0.0),
+    "tangential": (-0.1, 0.02, 0.04, -0.03, 0.01),
+}
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_behind_a_lens_the_picture_shows_what_the_rays_meet(name: str, tmp_path: Path) -> None:
+    """Black parts before a white sky, in the picture as it is stored: a pixel is dark as far as parts cover it."""
+    meshes, camera = _meshes(), Intrinsics(240, 180, 230.0, 228.0, 121.3, 86.6, LENSES[name])
+    settings = RenderSettings(samples=16, denoiser="none", bounces=0)
+    of_blender = {("model", key): Mesh(vertices / 1000, faces) for key, (vertices, faces) in meshes.items()}
+    session = BlenderSession(of_blender, camera, settings, TableSettings(), log=tmp_path / "log")
+    spec, poses = _scene(
+        ["objects.count=[9, 9]", "camera.distance_m=[0.3, 0.3]", "camera.elevation_deg=[70, 80]"],
+        dict.fromkeys(meshes, 0.06),
+        drop=0,
+    )
+    black = tuple(dataclasses.replace(item, material=Material((0.0, 0.0, 0.0), 1.0, 0.0)) for item in spec.objects)
+    spec = dataclasses.replace(spec, objects=black, ambient=AmbientLight(1.0, (1.0, 1.0, 1.0)))
+    caster = RayCaster({("model", key): mesh for key, mesh in meshes.items()})
+    with session.scene(spec, poses) as scene:
+        for item in session.bpy.context.scene.objects:
+            item.hide_render = item.type == "MESH" and not item.name.startswith("object")
+        light = scene.render(0)
+        ours = _annotate(caster, camera, spec, poses, scene.extrinsics(0)).instance_ids >= 0
+    theirs = light[..., 1] < 0.5
+    assert light.shape == (180, 240, 3)
+    assert ours[np.r_[:20, -20:0]].any(), "parts are near the border, where the lens bends most"
+    iou = (ours & theirs).sum() / (ours | theirs).sum()
+    assert iou >= 0.99
+    offset = np.argwhere(ours).mean(axis=0) - np.argwhere(theirs).mean(axis=0)
+    assert np.abs(offset).max() < 0.1

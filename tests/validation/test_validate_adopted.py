@@ -326,11 +326,11 @@ def _cameras_without_K(root: Path, scene_id: int = 1) -> None:
 
 def test_camera_models_are_named_as_unsupported(adopted: Path) -> None:
     _cameras_without_K(adopted)
-    with pytest.raises(ValueError, match=r"000001: scene_camera\.json: image 0 has cam_model instead of cam_K"):
+    with pytest.raises(ValueError, match=r"scene_camera\.json: image 0: cam_model is CameraModelType\.FISHEYE624"):
         adopt(adopted, workers=1)
     report = validate(adopted, workers=1)
     assert [f.message for f in report.findings] == [
-        "3 images have cam_model instead of cam_K, as BOP has it since 2024; only pinhole cameras are supported"
+        "3 images have a cam_model that is not supported; PinholePlane and OpenCV, with their parameters, are"
     ]
 
 
