@@ -16,7 +16,8 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 
 from synthetless import assets
 from synthetless.errors import UserError
@@ -24,8 +25,10 @@ from synthetless.io.documents import parse_document, read_document, shown
 from synthetless.io.files import atomic_write
 from synthetless.scenes.settings import (
     CONTAINERS,
+    DEPTH_SENSORS,
     SENSORS,
     Bounds,
+    DepthSensorSettings,
     RoomSettings,
     SceneSettings,
     SensorSettings,
@@ -44,16 +47,18 @@ SPLIT = "train_synthetless"
 
 _NAMED: Mapping[tuple[str, ...], Callable[[str], dict[str, Any]]] = {
     ("sensor",): lambda name: {} if name == "none" else {"preset": name},
+    ("depth_sensor",): lambda name: {} if name == "none" else {"preset": name},
     ("light", "room"): lambda _: {},
     ("release", "container"): lambda name: deepcopy(CONTAINERS.get(name, {name: {}})),
 }
 """Groups of settings that may be given by name, and what a name stands for when an override changes one of them."""
 _NAMES: Mapping[type[Settings], tuple[str, ...]] = {
     SensorSettings: ("none", *SENSORS),
+    DepthSensorSettings: ("none", *DEPTH_SENSORS),
     RoomSettings: ("none", "ranges"),
 }
 
-Output = Literal["rgb", "depth", "masks", "normals", "object_coordinates", "exr"]
+Output = Literal["rgb", "depth", "depth_sensed", "masks", "normals", "object_coordinates", "exr"]
 
 
 _EXPECTED = {"tuple_type": "expected a list, such as [min, max]", "model_type": "expected a mapping of settings"}
@@ -112,7 +117,8 @@ class Recipe(SceneSettings):
     source: SourceSettings = Field(default_factory=SourceSettings)
     """Models and textures."""
     outputs: tuple[Output, ...] = ("rgb", "depth", "masks")
-    """Files written for each image: any of rgb, depth, masks, normals, object_coordinates, exr (the linear image)."""
+    """Files written for each image: any of rgb, depth, depth_sensed (as a depth camera measures it: depth_sensor),
+    masks, normals, object_coordinates, exr (the linear image)."""
     encoding: EncodingSettings = Field(default_factory=EncodingSettings)
     """How they are encoded."""
     labels: LabelSettings = Field(default_factory=LabelSettings)
@@ -128,6 +134,22 @@ class Recipe(SceneSettings):
         if source.get("distractors") is None or not isinstance(objects, dict) or "distractors" in objects:
             return given
         return {**given, "objects": {**objects, "distractors": DISTRACTORS}}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_a_depth_camera(cls, given: Any) -> Any:
+        """An output that needs one, and no more said: written out likewise."""
+        if isinstance(given, dict) and "depth_sensor" not in given and "depth_sensed" in (given.get("outputs") or ()):
+            return {**given, "depth_sensor": next(iter(DEPTH_SENSORS))}
+        return given
+
+    @field_validator("outputs")
+    @classmethod
+    def _refuse_no_depth_camera(cls, given: tuple[Output, ...], others: ValidationInfo) -> tuple[Output, ...]:
+        if "depth_sensed" in given and others.data.get("depth_sensor", ...) is None:
+            names = " or ".join(DEPTH_SENSORS)
+            raise PydanticCustomError("outputs", "depth_sensed needs depth_sensor: {names}", {"names": names})
+        return given
 
     @property
     def intrinsics(self) -> Intrinsics:

@@ -19,6 +19,7 @@ from synthetless.scenes.settings import (
     BoxSettings,
     CameraSettings,
     ContainerSettings,
+    DepthSensorSettings,
     FloatRange,
     LightSettings,
     ObjectSettings,
@@ -33,6 +34,7 @@ from synthetless.scenes.spec import (
     AreaLight,
     ContainerKind,
     ContainerSpec,
+    DepthSensorSpec,
     EnvironmentSpec,
     Material,
     ObjectSpec,
@@ -71,6 +73,7 @@ class Stream(IntEnum):
     UPRIGHT = 10
     ENVIRONMENT = 11
     COLOUR = 12
+    DEPTH_SENSOR = 13
 
 
 @dataclass(frozen=True)
@@ -195,6 +198,28 @@ def _container(kind: ContainerKind, settings: BoxSettings, rng: np.random.Genera
 def sample_sensor(settings: SensorSettings, seed: int, drop: int, view: int) -> SensorSpec:
     """Draw the camera of one image; arguments as for ``sample_scene``, and the view of the drop."""
     return draw_sensor(settings, _stream(seed, drop, Stream.SENSOR, view, settings.variant))
+
+
+def sample_depth_sensor(settings: DepthSensorSettings, seed: int, drop: int, view: int) -> DepthSensorSpec:
+    """Draw the depth camera of one image; arguments as for ``sample_sensor``."""
+    rng = _stream(seed, drop, Stream.DEPTH_SENSOR, view, settings.variant)
+    return DepthSensorSpec(
+        baseline_m=_uniform(rng, settings.baseline_m),
+        noise_mm=_uniform(rng, settings.noise_mm),
+        noise_growth_mm=_uniform(rng, settings.noise_growth_mm),
+        noise_from_m=settings.noise_from_m,
+        noise_order=settings.noise_order,
+        noise_tilt_mm=_uniform(rng, settings.noise_tilt_mm),
+        lateral_px=_uniform(rng, settings.lateral_px),
+        edges=settings.edges,
+        disparity_step_px=_uniform(rng, settings.disparity_step_px),
+        step_mm=_uniform(rng, settings.step_mm),
+        grazing_deg=_uniform(rng, settings.grazing_deg),
+        dark=_uniform(rng, settings.dark),
+        speckle=_uniform(rng, settings.speckle),
+        range_m=settings.range_m,
+        noise_seed=int(rng.integers(2**32)),
+    )
 
 
 def draw_sensor(settings: SensorSettings, rng: np.random.Generator) -> SensorSpec:

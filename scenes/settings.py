@@ -425,6 +425,81 @@ def _sensor_by_name(given: Any) -> Any:
     return None if given == "none" else {"preset": given}
 
 
+DEPTH_SENSORS: dict[str, dict[str, Any]] = {
+    "structured_light": {},
+    "time_of_flight": {
+        "baseline_m": (0.0, 0.0),
+        "noise_mm": (0.5, 0.5),
+        "noise_growth_mm": (1.0, 1.0),
+        "noise_from_m": 0.5,
+        "noise_order": 1,
+        "noise_tilt_mm": (0.0, 0.0),
+        "lateral_px": (0.25, 0.25),
+        "edges": "mixed",
+        "disparity_step_px": (0.0, 0.0),
+        "step_mm": (1.0, 1.0),
+        "grazing_deg": (78.0, 86.0),
+        "dark": (0.005, 0.02),
+    },
+}
+"""What the named depth cameras stand for."""
+
+
+class DepthSensorSettings(Settings):
+    """A depth camera, for the output depth_sensed: what its projector reaches, its noise, its steps."""
+
+    preset: Literal["structured_light", "time_of_flight"] = "structured_light"
+    """Sets all that is not given: as below, or a camera that times its light."""
+    variant: Annotated[int, Bounds(0, 1_000_000)] = 0
+    """Another number draws other values and other noise for the same scenes."""
+    baseline_m: Annotated[FloatRange, Bounds(-1, 1, "m")] = (0.075, 0.075)
+    """How far to the right of the camera the projector is; its shadows lie to the left of objects. 0 has none."""
+    noise_mm: Annotated[FloatRange, Bounds(0, 100, "mm")] = (1.2, 1.2)
+    """Standard deviation of the axial noise at noise_from_m and nearer, seen straight on."""
+    noise_growth_mm: Annotated[FloatRange, Bounds(0, 1000, "mm")] = (1.9, 1.9)
+    """What is added to it for each metre beyond, or each square metre; see noise_order."""
+    noise_from_m: Annotated[float, Bounds(0, 100, "m")] = 0.4
+    """Depth from which on it grows."""
+    noise_order: Annotated[int, Bounds(1, 2)] = 2
+    """Whether it grows linearly or with the square of the depth."""
+    noise_tilt_mm: Annotated[FloatRange, Bounds(0, 100, "mm")] = (0.1, 0.1)
+    """What tilted surfaces add, in 1 m and at 45 degrees."""
+    lateral_px: Annotated[FloatRange, Bounds(0, 10, "px")] = (0.8, 0.8)
+    """Standard deviation of the lateral noise."""
+    edges: Literal["sharp", "mixed"] = "sharp"
+    """Whether a pixel has the depth of one surface, or, at edges, one between two surfaces."""
+    disparity_step_px: Annotated[FloatRange, Bounds(0, 10, "px")] = (0.125, 0.125)
+    """Steps in which the disparity is measured; 0 for none."""
+    step_mm: Annotated[FloatRange, Bounds(0, 100, "mm")] = (0.0, 0.0)
+    """Steps in which depth is measured, where it is not by disparity; 0 for none."""
+    grazing_deg: Annotated[FloatRange, Bounds(1, 90, "deg")] = (75.0, 85.0)
+    """Angle between ray and normal from which on nothing returns."""
+    dark: Annotated[FloatRange, Bounds(0, 1)] = (0.01, 0.03)
+    """Linear albedo, seen straight on, below which nothing returns; of metal, only what is not metallic counts."""
+    speckle: Annotated[FloatRange, Bounds(0, 1)] = (0.25, 0.25)
+    """Relative standard deviation of the returned light, which makes the edges of dark regions ragged."""
+    range_m: Annotated[FloatRange, Bounds(0, 100, "m")] = (0.3, 5.0)
+    """Nearest and farthest depth that is measured; nothing is drawn."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _follow_preset(cls, given: Any) -> Any:
+        """What is not given follows from the preset; written out, so that a stored recipe keeps its meaning."""
+        if not isinstance(given, dict):
+            return given
+        preset = given.get("preset", "structured_light")
+        return {**DEPTH_SENSORS.get(preset, {}), **given} if isinstance(preset, str) else given
+
+
+def _depth_sensor_by_name(given: Any) -> Any:
+    if not isinstance(given, str):
+        return given
+    if given not in ("none", *DEPTH_SENSORS):
+        names = ", ".join(("none", *DEPTH_SENSORS))
+        raise PydanticCustomError("depth_sensor", "unknown depth sensor; give {names}", {"names": names})
+    return None if given == "none" else {"preset": given}
+
+
 class SceneSettings(Settings):
     """All that decides what a scene looks like."""
 
@@ -442,3 +517,5 @@ class SceneSettings(Settings):
     """How the image is computed."""
     sensor: Annotated[SensorSettings | None, BeforeValidator(_sensor_by_name)] = None
     """The camera that takes the picture: none for what the renderer gives, primesense, or ranges; or its settings."""
+    depth_sensor: Annotated[DepthSensorSettings | None, BeforeValidator(_depth_sensor_by_name)] = None
+    """The depth camera of the output depth_sensed: none, structured_light, or time_of_flight; or its settings."""

@@ -250,6 +250,41 @@ class SensorSpec:
 
 
 @dataclass(frozen=True)
+class DepthSensorSpec:
+    """A depth camera, as it was for one image; what each value does is in ``scenes/depth_sensor.py``.
+
+    Attributes:
+        baseline_m: how far to the right of the camera its projector is.
+        noise_mm, noise_growth_mm, noise_from_m, noise_order, noise_tilt_mm: of the axial noise.
+        lateral_px: standard deviation of the lateral noise.
+        edges: "sharp" or "mixed".
+        disparity_step_px, step_mm: of the disparity, or, where that is 0 or there is no baseline, of the depth; 0 for
+            no steps.
+        grazing_deg: angle between ray and normal from which on nothing returns.
+        dark: albedo, seen straight on, below which nothing returns.
+        speckle: relative standard deviation of the returned light.
+        range_m: nearest and farthest depth that is measured.
+        noise_seed: of everything random.
+    """
+
+    baseline_m: float
+    noise_mm: float
+    noise_growth_mm: float
+    noise_from_m: float
+    noise_order: int
+    noise_tilt_mm: float
+    lateral_px: float
+    edges: Literal["sharp", "mixed"]
+    disparity_step_px: float
+    step_mm: float
+    grazing_deg: float
+    dark: float
+    speckle: float
+    range_m: tuple[float, float]
+    noise_seed: int
+
+
+@dataclass(frozen=True)
 class Intrinsics:
     """A camera without skew: image size, focal lengths and principal point, all in pixels, and its lens.
 

@@ -15,10 +15,10 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synthetless.extras import cv2
 from synthetless.scenes.lens import jacobian, pinhole_around, straight_points
 from synthetless.scenes.spec import Intrinsics
 

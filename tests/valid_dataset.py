@@ -20,7 +20,7 @@ from synthetless.config import Recipe, load_recipe
 from synthetless.dataset import records
 from synthetless.dataset.layout import ImagePlan, ScenePaths, by_drop, scene_ids
 from synthetless.dataset.reader import read_recipe
-from synthetless.dataset.store import DatasetStore, FinishedImage
+from synthetless.dataset.store import DatasetStore, FinishedImage, planned_depth_sensor
 from synthetless.io.models import ObjectModel, load_models
 from synthetless.scenes.rotations import matrix
 from synthetless.scenes.sampling import Catalogue, sample_scene
@@ -153,5 +153,6 @@ class _Maker:
     def _image(self, plan: ImagePlan, spec: SceneSpec, settled: tuple[Pose, ...]) -> FinishedImage:
         camera = self._recipe.camera
         light = np.random.default_rng([plan.number, 1]).random((camera.height, camera.width, 3)).astype(np.float32)
-        annotated = annotate_scene(self._caster, self._recipe, spec, settled, plan.view)
+        depth_sensor = planned_depth_sensor(self._recipe, plan)
+        annotated = annotate_scene(self._caster, self._recipe, spec, settled, plan.view, depth_sensor)
         return FinishedImage.of(self._recipe, plan, spec, settled, annotated, light)

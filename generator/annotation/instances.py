@@ -70,6 +70,22 @@ class InstanceAnnotation:
 
 
 @dataclass(frozen=True, eq=False)
+class Illumination:
+    """How the projector of a depth camera reaches what an image shows.
+
+    Attributes:
+        lit: (H, W) bool, whether nothing is between the surface and the projector.
+        cosine: (H, W) float32, of the angle between the viewing ray and the surface's normal; 0 without depth.
+        owner: (H, W) int32, the body that is seen: number among instances and, after them, occluders; the table comes
+            last, -1 is nothing.
+    """
+
+    lit: NDArray[np.bool_]
+    cosine: NDArray[np.float32]
+    owner: NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
 class ImageAnnotation:
     """One image.
 
@@ -80,6 +96,7 @@ class ImageAnnotation:
         normals: (H, W, 3) float32 geometric unit normals, camera frame, facing the camera; 0 without depth. Or None.
         object_coordinates_mm: (H, W, 3) float32, model coordinates of the surface point where
             ``instance_ids`` >= 0, else 0. Or None.
+        illumination: of all instances and occluders that were posed, however ``restricted``. Or None.
     """
 
     depth_mm: NDArray[np.float64]
@@ -87,6 +104,7 @@ class ImageAnnotation:
     instances: tuple[InstanceAnnotation, ...]
     normals: NDArray[np.float32] | None = None
     object_coordinates_mm: NDArray[np.float32] | None = None
+    illumination: Illumination | None = None
 
     def where_valid(self, has_depth: NDArray[np.bool_]) -> ImageAnnotation:
         """The same image with ``px_count_valid`` counted where a depth image holds a depth; without that, where any is.

@@ -20,6 +20,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from synthetless.annotation.instances import (
     BACKGROUND,
+    Illumination,
     ImageAnnotation,
     InstanceAnnotation,
     MeshKey,
@@ -52,6 +53,8 @@ _START_MARGIN_MM = 1.0
 _NOWHERE = 1e9
 """For x and y of a pixel, outside the image, at which the lens shows nothing: such a ray meets nothing."""
 _EDGE_SAMPLES = 33
+_SHADOW_MARGIN_MM = 0.2
+"""What lies so near to a point, on its way to the projector, is its own surface."""
 _FAR_OUTSIDE_PX = 1e9
 _NO_HEIGHT = 1e-9
 """A triangle this flat, as a share of its longest edge, has no normal in double precision, and no ray can hit it."""
@@ -246,6 +249,31 @@ class PosedSurface:
         depth[rows, columns] = z
         return depth
 
+    def blocks(self, source_mm: NDArray[np.float64], points_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(N,) whether the mesh is between a source of light in the plane z = 0 and points (N, 3), camera frame."""
+        ways = points_mm - source_mm
+        blocked = np.zeros(len(ways), dtype=bool)
+        hull = self._to_camera(self.surface.hull_mm) - source_mm
+        near = np.arange(len(ways))
+        if (
+            hull[:, 2].min() >= NEAR_CLIP_MM
+        ):  # then the mesh's outline, seen from the source, is within that of its hull
+            bounds = hull[:, :2] / hull[:, 2:]
+            seen = ways[:, :2] / ways[:, 2:]
+            inside = (seen >= bounds.min(axis=0)) & (seen <= bounds.max(axis=0))
+            near = np.flatnonzero(inside.all(axis=1) & (ways[:, 2] > hull[:, 2].min()))
+        if near.size:
+            length = np.linalg.norm(ways[near], axis=1)
+            origin = (source_mm - self.t_center) @ self.R_m2c
+            found = self.surface.scene.run(
+                np.broadcast_to(origin, (len(near), 3)).astype(np.float32),
+                (ways[near] @ self.R_m2c).astype(np.float32),
+                dists=(1 - _SHADOW_MARGIN_MM / length).astype(np.float32),
+                query="OCCLUDED",
+            )
+            blocked[near] = found != MISS
+        return blocked
+
     def normals(self, faces: NDArray[np.int32]) -> NDArray[np.float64]:
         """(N, 3) unit normals of triangles, camera frame."""
         return self.surface.normals.take(faces, axis=0) @ self.R_m2c.T
@@ -405,6 +433,7 @@ class RayCaster:
         visibility_delta_mm: float = 0.0,
         normals: bool = False,
         object_coordinates: bool = False,
+        projector_mm: ArrayLike | None = None,
     ) -> ImageAnnotation:
         """Measure one image. Of surfaces at exactly the same depth the first instance is seen, the table last.
 
@@ -417,6 +446,8 @@ class RayCaster:
                 bop_toolkit has it. With 0 an instance is visible exactly where it is the nearest surface.
             normals: also give the normals.
             object_coordinates: also give the object coordinates.
+            projector_mm: (3,) where a depth camera's projector is, in the camera's plane z = 0, to tell what it lights;
+                None for no projector.
 
         Raises:
             ValueError: the tolerance is negative, or a mesh is unknown.
@@ -434,6 +465,9 @@ class RayCaster:
             instances=tuple(scene.instance(number, visibility_delta_mm) for number in range(len(instances))),
             normals=scene.normals() if normals else None,
             object_coordinates_mm=scene.object_coordinates_mm(len(instances)) if object_coordinates else None,
+            illumination=None
+            if projector_mm is None
+            else scene.illumination(Rays.through(camera, image), projector_mm),
         )
 
     def whole_coordinates_mm(
@@ -551,6 +585,22 @@ class _NearestSurface:
             towards = -np.copysign(1.0, np.einsum("ij,ij->i", normals, hit.rays.at(rows, columns)))
             result[hit.rays.window.slices_in(self._image)][rows, columns] = normals * towards[:, None]
         return result
+
+    def illumination(self, rays: Rays, projector_mm: ArrayLike) -> Illumination:
+        """What a projector lights; see ``RayCaster.annotate``."""
+        source = np.asarray(projector_mm, dtype=np.float64)
+        rows, columns = pixels_where(np.isfinite(self.depth_mm))
+        towards = rays.at(rows, columns)
+        cosine, lit = np.zeros(self._image.shape, dtype=np.float32), np.zeros(self._image.shape, dtype=bool)
+        facing = -np.einsum("ij,ij->i", self.normals()[rows, columns], towards)
+        cosine[rows, columns] = facing / np.sqrt(np.einsum("ij,ij->i", towards, towards))
+        free = np.ones(len(rows), dtype=bool)
+        if source.any():  # a projector at the camera lights all that is seen
+            points = towards * self.depth_mm[rows, columns, None]
+            for hit in self._hits:
+                free[free] = ~hit.body.blocks(source, points[free])
+        lit[rows, columns] = free
+        return Illumination(lit, cosine, self.owner)
 
     def object_coordinates_mm(self, n_bodies: int) -> NDArray[np.float32]:
         """(H, W, 3) model coordinates on the first bodies, 0 elsewhere."""

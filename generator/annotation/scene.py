@@ -15,10 +15,14 @@ from synthetless.io.images import has_depth
 from synthetless.io.models import ObjectModel
 from synthetless.scenes.camera import extrinsics, settled_centre
 from synthetless.scenes.container import container_mesh
+from synthetless.scenes.depth_sensor import Returns, sense
 from synthetless.scenes.rotations import matrix
-from synthetless.scenes.spec import Pose, Role, SceneSpec
+from synthetless.scenes.spec import DepthSensorSpec, Pose, Role, SceneSpec
+from synthetless.scenes.srgb import LUMINANCE_WEIGHTS
 
 MM_PER_M = 1000.0
+_TABLE_ALBEDO = 0.4
+"""The table's texture is not known to the rays: for a depth camera it is as bright everywhere."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +35,7 @@ class AnnotatedScene:
         models: the labelled models of which a pixel could be in the image, hidden or not.
         numbers: their numbers in the scene's objects.
         image: what is seen; its instances are those of ``models``.
+        sensed_mm: (H, W) z as a depth camera measures it, 0 where it has none; None without one.
     """
 
     R_w2c: NDArray[np.float64]
@@ -38,6 +43,7 @@ class AnnotatedScene:
     models: tuple[PosedModel, ...]
     numbers: tuple[int, ...]
     image: ImageAnnotation
+    sensed_mm: NDArray[np.float64] | None = None
 
 
 def scene_caster(models: Mapping[Role, Mapping[int, ObjectModel]]) -> RayCaster:
@@ -47,7 +53,12 @@ def scene_caster(models: Mapping[Role, Mapping[int, ObjectModel]]) -> RayCaster:
 
 
 def annotate_scene(
-    caster: RayCaster, recipe: Recipe, scene: SceneSpec, settled: Sequence[Pose], view: int
+    caster: RayCaster,
+    recipe: Recipe,
+    scene: SceneSpec,
+    settled: Sequence[Pose],
+    view: int,
+    depth_sensor: DepthSensorSpec | None = None,
 ) -> AnnotatedScene:
     """Measure one view of a scene: poses, depth, masks, visibility.
 
@@ -59,6 +70,7 @@ def annotate_scene(
         scene: what was built.
         settled: pose at rest of each of its objects, world frame, metres.
         view: which of its views.
+        depth_sensor: the depth camera, if one measures the view, too.
 
     Raises:
         ValueError: a mesh is not among the caster's.
@@ -79,12 +91,26 @@ def annotate_scene(
         recipe.labels.visibility_delta_mm,
         "normals" in recipe.outputs,
         "object_coordinates" in recipe.outputs,
+        None if depth_sensor is None else (depth_sensor.baseline_m * MM_PER_M, 0.0, 0.0),
     )
+    sensed_mm = None
+    if depth_sensor is not None and image.illumination is not None:
+        seen = image.illumination
+        returns = Returns(image.depth_mm, seen.lit, seen.cosine, _albedo(scene).take(seen.owner))
+        sensed_mm = sense(returns, recipe.intrinsics, depth_sensor)
     if "depth" in recipe.outputs:
         image = image.where_valid(has_depth(image.depth_mm, recipe.encoding.depth_scale))
     inside = [n for n, instance in enumerate(image.instances) if instance.mask.any()]
     numbers = tuple(labelled[n] for n in inside)
-    return AnnotatedScene(R_w2c, t_w2c, tuple(posed[n] for n in numbers), numbers, image.restricted(inside))
+    return AnnotatedScene(R_w2c, t_w2c, tuple(posed[n] for n in numbers), numbers, image.restricted(inside), sensed_mm)
+
+
+def _albedo(scene: SceneSpec) -> NDArray[np.float32]:
+    """What the materials of a scene scatter, in the order of ``Illumination.owner``, whose -1 is nothing."""
+    of_roles = [[item.material for item in scene.objects if (item.role == "model") is named] for named in (True, False)]
+    materials = [*of_roles[0], *of_roles[1], *([] if scene.container is None else [scene.container.material])]
+    scattered = [float(np.dot(made_of.albedo, LUMINANCE_WEIGHTS)) * (1 - made_of.metallic) for made_of in materials]
+    return np.array([*scattered, _TABLE_ALBEDO, 0.0], dtype=np.float32)
 
 
 def container_surfaces(

@@ -139,6 +139,9 @@ class ScenePaths:
     def depth(self, im_id: int) -> Path:
         return self.root / "depth" / f"{im_id:06d}.png"
 
+    def depth_sensed(self, im_id: int) -> Path:
+        return self.root / "depth_sensed" / f"{im_id:06d}.png"
+
     def mask(self, im_id: int, gt_id: int) -> Path:
         return self.root / "mask" / f"{im_id:06d}_{gt_id:06d}.png"
 

@@ -239,6 +239,11 @@ class Image:
         path = self.paths.depth(self.im_id)
         return images.decode_depth(read_bytes(path), self.depth_scale, path)
 
+    def depth_sensed_mm(self) -> Floats:
+        """(H, W) z in millimetres as a depth camera measures it, 0 where it has none; if it is among the outputs."""
+        path = self.paths.depth_sensed(self.im_id)
+        return images.decode_depth(read_bytes(path), self.depth_scale, path)
+
     def normals(self) -> Floats:
         """(H, W, 3) unit normals, camera frame, 0 where there is no surface."""
         path = self.paths.normals(self.im_id)

@@ -23,7 +23,16 @@ from synthetless.annotation.instances import InstanceAnnotation
 from synthetless.errors import UserError
 from synthetless.io.documents import shown
 from synthetless.io.files import read_json, write_json
-from synthetless.scenes.spec import NO_DISTORTION, Coefficients, Intrinsics, Pose, SceneSpec, SensorSpec, plain
+from synthetless.scenes.spec import (
+    NO_DISTORTION,
+    Coefficients,
+    DepthSensorSpec,
+    Intrinsics,
+    Pose,
+    SceneSpec,
+    SensorSpec,
+    plain,
+)
 
 MIN_VISIB_FRACT = 0.1
 """Instances with a smaller visible fraction are marked ``ignore`` in scene_gt_coco.json, as bop_toolkit does."""
@@ -278,6 +287,7 @@ class ImageSpec:
         scene: what was built.
         settled: pose of each object at rest.
         sensor: the camera that took the picture; without one, the record leaves it out.
+        depth_sensor: the depth camera of the output depth_sensed; likewise.
     """
 
     image_id: int
@@ -287,6 +297,7 @@ class ImageSpec:
     scene: SceneSpec
     settled: tuple[Pose, ...]
     sensor: SensorSpec | None = None
+    depth_sensor: DepthSensorSpec | None = None
 
 
 class ImageRecord(TypedDict):

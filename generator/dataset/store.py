@@ -19,7 +19,6 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetless.annotation.instances import ImageAnnotation
 from synthetless.annotation.scene import AnnotatedScene
 from synthetless.config import Recipe, dump_recipe
 from synthetless.dataset import records
@@ -44,8 +43,8 @@ from synthetless.io import images
 from synthetless.io.color import exposure_gain, picture
 from synthetless.io.files import atomic_write, in_turn, read_json, replace_file, write_json, write_json_lines
 from synthetless.io.models import INFO_FILE, ObjectModel, object_names, read_models_info, texture_file
-from synthetless.scenes.sampling import sample_sensor
-from synthetless.scenes.spec import Pose, SceneSpec, SensorSpec
+from synthetless.scenes.sampling import sample_depth_sensor, sample_sensor
+from synthetless.scenes.spec import DepthSensorSpec, Pose, SceneSpec, SensorSpec
 from synthetless.symmetry import SymmetryTable
 
 _SIX_DIGITS = re.compile(r"\d{6}")
@@ -92,13 +91,20 @@ class FinishedImage:
         """
         gain = 1.0 if linear is None else exposure_gain(linear, recipe.render.exposure)
         rgb = None if linear is None else picture(linear, gain, planned_sensor(recipe, plan), recipe.render.shoulder)
-        files = _encode(recipe, plan.im_id, annotated.image, rgb, linear)
+        files = _encode(recipe, plan.im_id, annotated, rgb, linear)
         return cls(plan, files, image_record(recipe, plan, scene, settled, annotated, gain))
 
 
 def planned_sensor(recipe: Recipe, plan: ImagePlan) -> SensorSpec | None:
     """The camera of an image; None if the recipe has none."""
     return None if recipe.sensor is None else sample_sensor(recipe.sensor, recipe.seed, plan.drop, plan.view)
+
+
+def planned_depth_sensor(recipe: Recipe, plan: ImagePlan) -> DepthSensorSpec | None:
+    """The depth camera of an image; None if its output is not asked for."""
+    if recipe.depth_sensor is None or "depth_sensed" not in recipe.outputs:
+        return None
+    return sample_depth_sensor(recipe.depth_sensor, recipe.seed, plan.drop, plan.view)
 
 
 def image_record(
@@ -113,8 +119,8 @@ def image_record(
     camera, scale = recipe.intrinsics, recipe.encoding.depth_scale
     K, model = records.camera_matrix(camera), records.camera_model(camera)
     instances = annotated.image.instances
-    sensor = planned_sensor(recipe, plan)
-    spec = ImageSpec(plan.im_id, plan.view, exposure_gain, annotated.numbers, scene, tuple(settled), sensor)
+    sensors = planned_sensor(recipe, plan), planned_depth_sensor(recipe, plan)
+    spec = ImageSpec(plan.im_id, plan.view, exposure_gain, annotated.numbers, scene, tuple(settled), *sensors)
     return {
         "camera": records.camera_entry(K, annotated.R_w2c, annotated.t_w2c, scale, model),
         "gt": [records.gt_entry(model.obj_id, model.R_m2c, model.t_m2c) for model in annotated.models],
@@ -317,12 +323,12 @@ def encode_rgb(recipe: Recipe, rgb: NDArray[np.uint8]) -> bytes:
 def _encode(
     recipe: Recipe,
     im_id: int,
-    annotation: ImageAnnotation,
+    annotated: AnnotatedScene,
     rgb: NDArray[np.uint8] | None,
     linear: NDArray[np.float32] | None,
 ) -> dict[str, bytes]:
     """The files of one image, by their paths inside the scene folder."""
-    paths, encoding = ScenePaths(Path()), recipe.encoding
+    paths, encoding, annotation = ScenePaths(Path()), recipe.encoding, annotated.image
     files: dict[Path, bytes] = {}
     wanted = set(recipe.outputs)
     if "rgb" in wanted and rgb is not None:
@@ -331,6 +337,8 @@ def _encode(
         files[paths.exr(im_id)] = images.encode_exr(linear)
     if "depth" in wanted:
         files[paths.depth(im_id)] = images.encode_depth(annotation.depth_mm, encoding.depth_scale)
+    if annotated.sensed_mm is not None:
+        files[paths.depth_sensed(im_id)] = images.encode_depth(annotated.sensed_mm, encoding.depth_scale)
     if "masks" in wanted:
         for gt_id, instance in enumerate(annotation.instances):
             files[paths.mask(im_id, gt_id)] = images.encode_mask(instance.mask)

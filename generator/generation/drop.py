@@ -12,7 +12,7 @@ from pathlib import Path
 from synthetless.annotation.scene import annotate_scene, scene_caster
 from synthetless.config import Recipe
 from synthetless.dataset.layout import ImagePlan
-from synthetless.dataset.store import FinishedImage
+from synthetless.dataset.store import FinishedImage, planned_depth_sensor
 from synthetless.generation.progress import COLLIDERS, DROPPING, RENDERING, Report, Stage, unreported
 from synthetless.generation.sources import Sources, cached_collider
 from synthetless.io.cache import Cache
@@ -132,6 +132,7 @@ class DropRenderer:
         return self._colliders[key]
 
     def _image(self, plan: ImagePlan, scene: BlenderScene, settled: Sequence[Pose]) -> FinishedImage:
-        annotated = annotate_scene(self._caster, self._recipe, scene.spec, settled, plan.view)
+        depth_sensor = planned_depth_sensor(self._recipe, plan)
+        annotated = annotate_scene(self._caster, self._recipe, scene.spec, settled, plan.view, depth_sensor)
         linear = scene.render(plan.view) if {"rgb", "exr"} & set(self._recipe.outputs) else None
         return FinishedImage.of(self._recipe, plan, scene.spec, settled, annotated, linear)

@@ -32,7 +32,7 @@ from synthetless.dataset.records import (
     coco_annotations,
     gt_info_entry,
 )
-from synthetless.dataset.store import planned_sensor
+from synthetless.dataset.store import planned_depth_sensor, planned_sensor
 from synthetless.extras import cv2
 from synthetless.io.images import (
     COORDINATE_SCALE_MM,
@@ -79,6 +79,10 @@ _LARGEST_M = 100.0
 """No container is larger."""
 
 
+_SENSED = Tolerance(share=1e-3, px=4)
+"""Of a depth camera's image, which decides about many pixels by thresholds and steps."""
+
+
 # Cameras and poses: without rays
 
 
@@ -98,6 +102,8 @@ def check_specs(source: Source, scene: SceneRecords, plans: Sequence[ImagePlan])
         containers = source.recipe.release.container
         if spec.scene.container != sample_container(containers, source.recipe.seed, spec.scene.drop):
             yield Finding("spec", path, "records another container than the recipe draws for this drop", im_id)
+        if plan is not None and spec.depth_sensor != planned_depth_sensor(source.recipe, plan):
+            yield Finding("spec", path, "records another depth sensor than the recipe draws for this image", im_id)
         fault = incoherence(spec)
         if fault:
             yield Finding("spec", path, fault, im_id)
@@ -206,7 +212,8 @@ def recompute(source: Source, spec: ImageSpec | None) -> AnnotatedScene | None:
         return None
     with np.errstate(all="ignore"):  # of absurd numbers in a damaged record
         try:
-            return annotate_scene(_caster(source.meshes), source.recipe, spec.scene, spec.settled, spec.view)
+            caster, recipe = _caster(source.meshes), source.recipe
+            return annotate_scene(caster, recipe, spec.scene, spec.settled, spec.view, spec.depth_sensor)
         except (ValueError, OverflowError):
             return None
 
@@ -217,6 +224,7 @@ class StoredImage:
 
     Attributes:
         depth_mm: (H, W), 0 for none.
+        sensed_mm: the same as a depth camera measures it.
         masks: by gt_id.
         normals: (H, W, 3).
         coordinates_mm: (H, W, 4), the last 1 where there is a point.
@@ -225,6 +233,7 @@ class StoredImage:
     """
 
     depth_mm: Array | None
+    sensed_mm: Array | None
     masks: list[InstanceMasks]
     normals: Array | None
     coordinates_mm: Array | None
@@ -250,6 +259,7 @@ class StoredImage:
 
         return cls(
             pictures.read(paths.depth(im_id), depth) if source.has("depth") else None,
+            pictures.read(paths.depth_sensed(im_id), depth) if source.has("depth_sensed") else None,
             read_masks(paths, im_id, n_instances, pictures) if source.has("masks") else [InstanceMasks()] * n_instances,
             pictures.read(paths.normals(im_id), decode_normals) if source.has("normals") else None,
             pictures.read(paths.object_coordinates(im_id), _coordinates) if source.has("object_coordinates") else None,
@@ -377,6 +387,10 @@ def _compare_images(
     paths, image = scene.paths, expected.image
     if stored.depth_mm is not None:
         yield from _compare_depth(source.recipe, paths.depth(im_id), im_id, stored.depth_mm, expected)
+    if stored.sensed_mm is not None and expected.sensed_mm is not None:
+        yield from _compare_sensed(
+            source.recipe, paths.depth_sensed(im_id), im_id, stored.sensed_mm, expected.sensed_mm
+        )
     if stored.normals is not None and image.normals is not None:
         wrong = (np.abs(stored.normals - image.normals) > _NORMAL_TOLERANCE).any(axis=2)
         if (count := int(np.count_nonzero(wrong))) > _IN_AN_IMAGE.allowed(wrong.size):
@@ -413,6 +427,17 @@ def _compare_depth(
             f"first, column {column}, row {row}, has {stored_mm[row, column]:.3f} mm, not {within[row, column]:.3f}"
         )
         yield Finding("depth", path, message, im_id, None if gt_id == BACKGROUND else gt_id)
+
+
+def _compare_sensed(recipe: Recipe, path: Path, im_id: int, stored_mm: Array, expected_mm: Array) -> Iterator[Finding]:
+    """A depth camera's depth that is not the recomputed one."""
+    scale = recipe.encoding.depth_scale
+    within = np.where(expected_mm < max_depth_mm(scale) + scale / 2, expected_mm, 0.0)
+    off = np.abs(stored_mm - within)
+    wrong = off > scale / 2 * (1 + 1e-6) + _TOLERANCE_MM
+    if (count := int(np.count_nonzero(wrong))) > _SENSED.allowed(wrong.size):
+        message = f"{count} pixels differ from the recomputed depth of the depth camera, by up to {off.max():.2f} mm"
+        yield Finding("depth", path, message, im_id)
 
 
 def _only_table(recipe: Recipe, expected: AnnotatedScene) -> Mask:

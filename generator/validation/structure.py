@@ -385,6 +385,7 @@ def _expected_files(source: Source, scene: SceneRecords) -> dict[Path, dict[str,
     per_image = {
         "rgb": lambda im_id: paths.rgb(im_id, extension),
         "depth": paths.depth,
+        "depth_sensed": paths.depth_sensed,
         "normals": paths.normals,
         "object_coordinates": paths.object_coordinates,
         "exr": paths.exr,
