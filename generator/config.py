@@ -139,9 +139,9 @@ class Recipe(SceneSettings):
     @classmethod
     def _with_a_depth_camera(cls, given: Any) -> Any:
         """An output that needs one, and no more said: written out likewise."""
-        if isinstance(given, dict) and "depth_sensor" not in given and "depth_sensed" in (given.get("outputs") or ()):
-            return {**given, "depth_sensor": next(iter(DEPTH_SENSORS))}
-        return given
+        if not isinstance(given, dict) or "depth_sensor" in given or not isinstance(given.get("outputs"), list | tuple):
+            return given
+        return {**given, "depth_sensor": next(iter(DEPTH_SENSORS)) if "depth_sensed" in given["outputs"] else None}
 
     @field_validator("outputs")
     @classmethod

@@ -21,6 +21,7 @@ Needs NumPy and OpenCV only.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,7 +34,7 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 _MM = 1000.0
-_MOST_TILT_RAD = np.radians(89.0)
+_MOST_TILT_RAD = math.radians(89.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +68,7 @@ def sense(seen: Returns, camera: Intrinsics, drawn: DepthSensorSpec) -> Floats:
     shape = seen.depth_mm.shape
     noise = [np.random.default_rng([drawn.noise_seed, purpose]) for purpose in range(3)]
     tilt = np.arccos(np.clip(seen.cosine, 0, 1))
-    returned = seen.lit & (seen.depth_mm > 0) & (tilt <= np.radians(drawn.grazing_deg))
+    returned = seen.lit & (seen.depth_mm > 0) & (tilt <= math.radians(drawn.grazing_deg))
     speckle = 1 + drawn.speckle * noise[0].standard_normal(shape, dtype=np.float32)
     returned &= seen.albedo * seen.cosine * speckle >= drawn.dark
     z, tilt = _beside(np.where(returned, seen.depth_mm, 0).astype(np.float32), tilt, drawn, noise[1])

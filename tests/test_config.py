@@ -103,8 +103,9 @@ def test_every_setting_is_described_with_its_range() -> None:
 @given(st.sampled_from([s.key for s in settings()]))
 def test_every_default_survives_being_set(key: str) -> None:
     default = next(setting.default for setting in settings() if setting.key == key)
-    group = next((name for name in ("sensor", "light.room") if key.startswith(f"{name}.")), None)
-    expected = load_recipe(None, [f"{group}=ranges"]) if group else Recipe()
+    names = {"sensor": "ranges", "depth_sensor": "structured_light", "light.room": "ranges"}
+    group = next((group for group in names if key.startswith(f"{group}.")), None)
+    expected = load_recipe(None, [f"{group}={names[group]}"]) if group else Recipe()
     assert load_recipe(None, [f"{key}={json.dumps(default)}"]) == expected
 
 

@@ -142,6 +142,9 @@ def bop_command(
     ] = None,
     xyz_crops: Annotated[bool, typer.Option("--xyz-crops", help="Object coordinates, as GDR-Net reads them.")] = False,
     fps: Annotated[bool, typer.Option("--fps", help="Farthest points of the models, likewise.")] = False,
+    depth: Annotated[
+        Literal["exact", "sensed"], typer.Option(help="Exact depth, or as a depth camera measures it.")
+    ] = "exact",
     copy: Copy = False,
     as_json: AsJson = False,
 ) -> None:
@@ -150,5 +153,5 @@ def bop_command(
     from synthetless.exports.bop import export_bop
 
     with undisturbed(dataset, may_grow=True):
-        folder = export_bop(dataset, to, name, to_split, split, jpg, pixel_centre, scenes, xyz_crops, fps, copy)
+        folder = export_bop(dataset, to, name, to_split, split, jpg, pixel_centre, scenes, xyz_crops, fps, depth, copy)
     say(json.dumps({"folder": str(folder), "split": to_split}) if as_json else f"{to_split} of {name}: {folder}")

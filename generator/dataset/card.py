@@ -41,6 +41,7 @@ _TASKS = {"rgb": "keypoint-detection", "masks": "image-segmentation", "depth": "
 _FILES = {
     "rgb": ("`rgb/`", "colour, 8 bits"),
     "depth": ("`depth/`", "16-bit PNG; value × `depth_scale` = z in mm, 0 = none; ray-cast, without noise"),
+    "depth_sensed": ("`depth_sensed/`", "the same as a depth camera measures it, with noise and holes"),
     "masks": ("`mask/`, `mask_visib/`", "silhouette of each instance, whole and visible part, 0 or 255"),
     "normals": ("`normals/`", "16-bit PNG; (value − 32768) / 32767 = unit normal, camera frame"),
     "object_coordinates": ("`object_coordinates/`", "16-bit PNG; (value − 32768) × 0.02 = model coordinates in mm"),

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +57,9 @@ Source = tuple[int, int]
 """An image of the dataset: scene folder and image id."""
 
 
+DepthKind = Literal["exact", "sensed"]
+
+
 @dataclass(frozen=True)
 class BopExport(FolderExport):
     """A BOP dataset of another name.
@@ -69,6 +72,7 @@ class BopExport(FolderExport):
         scenes: number of scene folders; None: as many as are needed.
         xyz_crops: also write each instance's object coordinates.
         fps: also write farthest points of the models.
+        depth: "exact", or "sensed" as a depth camera measures it.
     """
 
     kind: ClassVar[str] = "bop"
@@ -84,6 +88,7 @@ class BopExport(FolderExport):
     scenes: int | None = None
     xyz_crops: bool = False
     fps: bool = False
+    depth: DepthKind = "exact"
 
     def __post_init__(self) -> None:
         for what, value in (("name", self.name), ("split", self.to_split)):
@@ -113,8 +118,7 @@ class BopExport(FolderExport):
             files["gt_canonical"][str(im_id)] = [self._moved(label) for label in labels.gt_canonical]
             rgb, content = self._rgb(paths.root / image.entry["file_name"])
             yield f"{scene}/rgb/{im_id:06d}{rgb}", content
-            if (depth := paths.depth(labels.im_id)).exists():
-                yield f"{scene}/depth/{im_id:06d}.png", depth
+            yield from self._depth(paths, labels.im_id, f"{scene}/depth/{im_id:06d}.png")
             for gt_id in range(len(labels.gt)):
                 for folder, mask in (("mask", paths.mask), ("mask_visib", paths.mask_visib)):
                     if (path := mask(labels.im_id, gt_id)).exists():
@@ -174,7 +178,19 @@ class BopExport(FolderExport):
             coco = read_scene_coco(paths)
             for image in annotated_images(paths, coco):
                 if image.labels.im_id in wanted:
+                    if "cam_K" not in image.labels.camera:
+                        raise UserError(
+                            f"{paths.scene_camera}: image {image.labels.im_id} was taken through a lens (cam_model); "
+                            "the loaders that this folder is for read cam_K"
+                        )
                     yield paths, image, coco
+
+    def _depth(self, paths: ScenePaths, im_id: int, to: str) -> Iterator[Entry]:
+        path = paths.depth(im_id) if self.depth == "exact" else paths.depth_sensed(im_id)
+        if path.exists():
+            yield to, path
+        elif self.depth == "sensed":
+            raise UserError(f"{path}: not there; generate the dataset with depth_sensed among its outputs")
 
     def _paths(self, scene_id: int) -> ScenePaths:
         return ScenePaths.of(self.dataset, scene_id, self.split)
@@ -284,6 +300,7 @@ def export_bop(
     scenes: int | None = None,
     xyz_crops: bool = False,
     fps: bool = False,
+    depth: DepthKind = "exact",
     copy: bool = False,
     workers: int | None = None,
 ) -> Path:
@@ -300,6 +317,7 @@ def export_bop(
         scenes: spread the images evenly over so many scene folders; None: 1000 in each.
         xyz_crops: write xyz_crop/SCENE/IMAGE_INSTANCE-xyz.pkl, for trainers like GDR-Net.
         fps: write models/fps_points.pkl, for the same.
+        depth: which depth images become those in depth/: "exact", or "sensed", as a depth camera measures it.
         copy: copy colour and depth images, for a folder that is to be sent; else link them.
         workers: processes; one per available core if None.
 
@@ -311,7 +329,7 @@ def export_bop(
             something, or cannot be written.
     """
     own = split or find_split(dataset)
-    export = BopExport(dataset, own, copy, name, to_split, jpg, pixel_centre, scenes, xyz_crops, fps)
+    export = BopExport(dataset, own, copy, name, to_split, jpg, pixel_centre, scenes, xyz_crops, fps, depth)
     write_export(export, to / name, workers)
     return to / name
 

@@ -14,6 +14,8 @@ from valid_dataset import small_scene_folders, write_dataset, write_models
 from synthetless.config import RecipeError, load_recipe
 from synthetless.dataset import Dataset
 from synthetless.dataset.reader import read_recipe, read_specs
+from synthetless.errors import UserError
+from synthetless.exports.bop import export_bop
 from synthetless.io.files import read_json_lines, write_json_lines
 from synthetless.validation import validate
 
@@ -93,6 +95,7 @@ def test_what_was_drawn_is_recorded(made: Path) -> None:
             ["outputs=[depth_sensed]", "depth_sensor=none"],
             "depth_sensed needs depth_sensor: structured_light or time_of",
         ),
+        (["outputs=5"], "outputs = 5: expected a list"),
         (["depth_sensor=lidar"], "unknown depth sensor; give none, structured_light, time_of_flight"),
         (["depth_sensor.dark=[0.5, 0.1]"], r"depth_sensor\.dark = \[0\.5, 0\.1\]: min 0\.5 is greater than max 0\.1"),
         (["depth_sensor.noise_order=3"], r"noise_order = 3: 3 is outside 1\.\.2"),
@@ -113,3 +116,12 @@ def test_a_name_stands_for_its_settings() -> None:
         load_recipe(None, ["outputs=[depth_sensed]"]).depth_sensor
         == load_recipe(None, ["depth_sensor=structured_light"]).depth_sensor
     )
+
+
+def test_loaders_may_be_given_it_as_depth(made: Path, tmp_path: Path) -> None:
+    export_bop(made / "sensed", tmp_path, depth="sensed", workers=1)
+    sensed = (made / "sensed/train_synthetless/000001/depth_sensed/000001.png").read_bytes()
+    assert (tmp_path / "tless/train_pbr/000000/depth/000001.png").read_bytes() == sensed
+    with pytest.raises(UserError, match=r"depth_sensed/000000\.png: not there; generate the dataset with depth_sensed"):
+        export_bop(made / "without", tmp_path / "other", depth="sensed", workers=1)
+    assert not (tmp_path / "other/tless").exists()

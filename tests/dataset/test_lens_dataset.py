@@ -17,6 +17,8 @@ from synthetless.dataset import Dataset
 from synthetless.dataset.labels import box_corners_mm
 from synthetless.dataset.records import read_scene_json, write_scene_json
 from synthetless.dataset.relabel import adopt
+from synthetless.errors import UserError
+from synthetless.exports.bop import export_bop
 from synthetless.exports.coco import export_coco
 from synthetless.exports.webdataset import export_webdataset
 from synthetless.learning.pose_error import ModelPoints, RigidPose
@@ -134,6 +136,12 @@ def test_exports_say_which_lens(dataset: Path, tmp_path: Path) -> None:
     assert validate(dataset, exports=[dataset / "coco.json", tmp_path / "shards"], workers=1).valid
 
 
+def test_loaders_that_know_pinholes_alone_get_no_lens(made: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"image 0 was taken through a lens \(cam_model\)"):
+        export_bop(made, tmp_path, workers=1)
+    assert not (tmp_path / "tless").exists()
+
+
 def test_others_datasets_with_a_lens_are_adopted(dataset: Path) -> None:
     expected = [[i.label for i in image.instances] for image in Dataset.open(dataset)]
     for name in ("dataset.json", "symmetries.json", ".records"):
@@ -149,11 +157,3 @@ def test_others_datasets_with_a_lens_are_adopted(dataset: Path) -> None:
             assert label is not None
             np.testing.assert_allclose(instance.label.corners_px, label.corners_px, atol=1e-6)
     assert validate(dataset, workers=1).valid
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_crops_are_not_cut_from_bent_images(made: Path) -> None:
-    data = pytest.importorskip("synthetless.learning.data")
-    sample = data.sample_of(Dataset.open(made)[0])
-    with pytest.raises(ValueError, match=r"image 000001_000000 has lens distortion"):
-        data.crops_of(sample, 32)

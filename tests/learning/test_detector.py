@@ -173,6 +173,26 @@ def test_crops_of_an_image_are_views_of_a_camera_that_looks_at_the_part(valid: P
         assert np.allclose(crops.R_m2c[i] @ sample.R_m2c[i].T @ sample.t_m2c[i], crops.t_m2c[i])
 
 
+def test_behind_a_lens_corners_are_bent_and_crops_are_refused(tmp_path: Path, builtin_models: Path) -> None:
+    write_dataset(tmp_path / "bent", builtin_models, ["images=2", "camera.distortion=[-0.6, 0.9, 0.01, -0.02, 0.3]"])
+    data = Dataset.open(tmp_path / "bent")
+    export_webdataset(tmp_path / "bent", tmp_path / "shards", workers=1)
+    parts = read_parts([data], ())
+    batcher = SampleBatcher(parts.maker(_training("labels=true")), parts.boxes_mm, parts.ids, 0.0)
+    samples = [*map(sample_of, data), *ShardImages(tmp_path / "shards", 1, 2, True)]
+    assert len(samples) == 4
+    for sample in samples:
+        corners = batcher.instances(sample).corners_px.numpy()
+        for of, obj_id, R, t in zip(corners, sample.obj_ids, sample.R_m2c, sample.t_m2c, strict=True):
+            box, lens = parts.boxes_mm[int(obj_id)], np.array([-0.6, 0.9, 0.01, -0.02, 0.3])
+            expected, _ = cv2.projectPoints(box, cv2.Rodrigues(R)[0], t, sample.K, lens)
+            np.testing.assert_allclose(of, expected.reshape(8, 2), rtol=1e-5, atol=1e-3)
+        with pytest.raises(
+            UserError, match=f"image {sample.key} has lens distortion; crops are cut from pinhole images"
+        ):
+            crops_of(sample, 32)
+
+
 def test_corners_survive_box_units() -> None:
     boxes, corners = torch.tensor([[3.0, 5, 43, 25]]), torch.rand(1, 8, 2) * 50
     assert torch.allclose(_to_pixels(_to_box_units(corners, boxes), boxes), corners, atol=1e-4)
