@@ -27,7 +27,16 @@ from synthetless.io import images
 from synthetless.io.files import atomic_write, link_or_copy, read_bytes
 from synthetless.io.models import BOX_EDGES
 from synthetless.scenes.lens import project
-from synthetless.scenes.spec import EnvironmentSpec, Material, PlaneSpec, RoomSpec, SensorSpec, Vector, View
+from synthetless.scenes.spec import (
+    DepthSensorSpec,
+    EnvironmentSpec,
+    Material,
+    PlaneSpec,
+    RoomSpec,
+    SensorSpec,
+    Vector,
+    View,
+)
 from synthetless.scenes.srgb import srgb_from_linear
 from synthetless.scenes.textures import PhotoTexture
 from synthetless.symmetry import SymmetryTable
@@ -388,6 +397,7 @@ def _sections(image: Image, recorded: ImageSpec | None) -> list[Section]:
             ],
         },
         *([] if recorded.sensor is None else [{"title": "Sensor", "rows": _sensor_rows(recorded.sensor)}]),
+        *([] if recorded.depth_sensor is None else [{"title": "Depth", "rows": _depth_rows(recorded.depth_sensor)}]),
     ]
 
 
@@ -428,6 +438,19 @@ def _environment_rows(environment: EnvironmentSpec) -> list[list[str]]:
         ["panorama", environment.file],
         ["turn", f"{environment.turn_deg:.1f}°"],
         ["strength", f"{environment.strength:.2f}"],
+    ]
+
+
+def _depth_rows(sensor: DepthSensorSpec) -> list[list[str]]:
+    disparity = sensor.disparity_step_px > 0 and sensor.baseline_m != 0
+    beyond = f"{sensor.noise_growth_mm:.2f} mm per m{'²' if sensor.noise_order == 2 else ''}"
+    return [
+        ["projector", f"{1000 * sensor.baseline_m:.0f} mm to the right"],
+        ["axial noise", f"{sensor.noise_mm:.2f} mm, {beyond} beyond {sensor.noise_from_m:.2f} m"],
+        ["lateral noise", f"{sensor.lateral_px:.2f} px, {sensor.edges} edges"],
+        ["steps", f"{sensor.disparity_step_px:.3f} px of disparity" if disparity else f"{sensor.step_mm:.2f} mm"],
+        ["grazing from", f"{sensor.grazing_deg:.1f}°"],
+        ["dark below", f"albedo {sensor.dark:.3f}"],
     ]
 
 

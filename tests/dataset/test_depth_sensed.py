@@ -17,6 +17,7 @@ from synthetless.dataset.reader import read_recipe, read_specs
 from synthetless.errors import UserError
 from synthetless.exports.bop import export_bop
 from synthetless.io.files import read_json_lines, write_json_lines
+from synthetless.preview.image import _sections
 from synthetless.validation import validate
 
 OUTPUTS = "outputs=[rgb, depth, masks, normals, depth_sensed]"
@@ -26,9 +27,10 @@ OUTPUTS = "outputs=[rgb, depth, masks, normals, depth_sensed]"
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sensed")
     models = write_models(folder / "models")
-    write_dataset(folder / "without", models, ["outputs=[rgb, depth, masks, normals]"])
-    write_dataset(folder / "sensed", models, [OUTPUTS, "objects.grey=[0, 0.9]", "depth_sensor.dark=[0.02, 0.04]"])
-    write_dataset(folder / "again", models, [OUTPUTS, "objects.grey=[0, 0.9]", "depth_sensor.dark=[0.02, 0.04]"])
+    write_dataset(folder / "without", models, ["images=2", "outputs=[rgb, depth, masks, normals]"])
+    sensed = ["images=2", OUTPUTS, "objects.grey=[0, 0.9]", "depth_sensor.dark=[0.02, 0.04]"]
+    write_dataset(folder / "sensed", models, sensed)
+    write_dataset(folder / "again", models, sensed)
     return folder
 
 
@@ -86,6 +88,9 @@ def test_what_was_drawn_is_recorded(made: Path) -> None:
     assert 75 <= drawn.grazing_deg <= 85
     assert read_recipe(made / "sensed").depth_sensor is not None
     assert read_specs(Dataset.open(made / "without")[0].paths)[0].depth_sensor is None
+    shown = {row[0]: row[1] for section in _sections(image, read_specs(image.paths)[0]) for row in section["rows"]}
+    assert shown["axial noise"] == "1.20 mm, 1.90 mm per m² beyond 0.40 m"
+    assert shown["steps"] == "0.125 px of disparity"
 
 
 @pytest.mark.parametrize(
