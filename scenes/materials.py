@@ -101,9 +101,16 @@ def _empty_material(bpy: Any, name: str) -> tuple[Any, Any, Any]:
     return made, tree.nodes, tree.links
 
 
-def glowing(bpy: Any, radiance: Vector) -> Any:
-    """A bpy material that emits light, equally in all directions, and reflects none; ``radiance`` is linear RGB."""
+def glowing(bpy: Any, radiance: Vector, is_aimed_at: bool) -> Any:
+    """A bpy material that emits light, equally in all directions, and reflects none.
+
+    Args:
+        bpy: where to.
+        radiance: linear RGB.
+        is_aimed_at: whether paths of light are led to it, as to a lamp, or find it when they bounce.
+    """
     made, nodes, links = _empty_material(bpy, "glowing")
+    made.cycles.emission_sampling = "AUTO" if is_aimed_at else "NONE"
     shader = nodes.new("ShaderNodeEmission")
     shader.inputs["Color"].default_value = (*radiance, 1.0)
     links.new(shader.outputs[0], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])

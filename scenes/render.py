@@ -85,7 +85,7 @@ class BlenderSession:
             lights.add_ambient(self.bpy, bpy_scene, spec.ambient)
             lights.add_lamp(self.bpy, collection, spec.light, centre_m)
             if spec.room is not None:
-                lights.add_room(self.bpy, collection, spec.room, spec.ambient, centre_m)
+                lights.add_room(self.bpy, collection, spec.room, spec.ambient, centre_m, self.settings.bounces)
             if spec.environment is not None:
                 self._add_panorama(bpy_scene.world, spec.environment, spec.ambient)
             self._add_table(collection, spec, centre_m)
@@ -173,6 +173,7 @@ class BlenderScene:
         """Linear image (H, W, 3), Rec. 709 primaries, of the given view."""
         scene = self.session.bpy.context.scene
         camera.place(scene.camera, *self.extrinsics(view))
+        scene.cycles.use_light_tree = lights.uses_tree(self.spec)
         scene.cycles.seed = (self.spec.drop * len(self.spec.views) + view) % 2**31
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "image.exr"

@@ -106,6 +106,19 @@ def test_the_ceiling_is_as_bright_as_the_recipe_says(session: BlenderSession) ->
     np.testing.assert_allclose(found, [0.6, 0.4, 0.2], rtol=0.03)
 
 
+def test_the_ceiling_shines_also_where_light_does_not_bounce(session: BlenderSession) -> None:
+    kept = session.settings
+    try:
+        session.settings = kept.model_copy(update={"bounces": 0})
+        session.configure(session.settings)
+        share = ceiling_share(6.0, 3.0 - CENTRE_M[2])
+        found = brightness(session, dark_room(ceiling=(0.6 / share, 0.4 / share, 0.2 / share)))
+    finally:
+        session.settings = kept
+        session.configure(kept)
+    np.testing.assert_allclose(found, [0.6, 0.4, 0.2], rtol=0.03)
+
+
 def test_ambient_light_is_the_same_inside_a_room(session: BlenderSession) -> None:
     np.testing.assert_allclose(brightness(session, dark_room(), ambient=0.35), 0.35, rtol=0.02)
 
