@@ -8,12 +8,13 @@ import cv2
 import numpy as np
 import pytest
 from detect_shapes import box, prism
+from notch import Notched
 from numpy.typing import NDArray
 
 from synthetless.io.meshes import TriangleMesh
 from synthetless.symmetry import SymmetryGroup, SymmetryTable
 from synthetless.symmetry.detection.detect import measure
-from synthetless.symmetry.detection.pictures import draw_table, picture
+from synthetless.symmetry.detection.pictures import draw_table, picture, views_left_open
 from synthetless.symmetry.table import QuasiSymmetry, SymmetryEntry
 
 VIEWS_PX, HEAD_PX = 1200, 34
@@ -76,6 +77,19 @@ def test_a_quasi_symmetry_is_drawn_below_with_the_detail_coloured(tmp_path: Path
     draw_table(table, tmp_path, tmp_path / "pictures", workers=1)
     image = cv2.imread(str(tmp_path / "pictures" / "obj_000001.png"))
     assert image is not None
-    upper, lower = (saturation(half[..., ::-1].astype(np.uint8)) for half in np.split(image, 2))
+    assert image.shape == (2 * 434 + 322, 1320, 3)
+    upper, lower = (saturation(half[..., ::-1].astype(np.uint8)) for half in np.split(image[: 2 * 434], 2))
     assert (upper > 60).mean() < 0.02
     assert (lower > 60).mean() > 0.1
+
+
+def test_the_views_that_hide_a_notch_are_those_from_behind() -> None:
+    """The notch is towards x: the middle of the map tells it, and both its ends, the back, do not."""
+    vertices, faces = Notched(depth_mm=4.0, half_width_deg=20.0).mesh(3.0)
+    mesh = TriangleMesh(vertices, faces, is_verbatim=False)
+    image = views_left_open(mesh, SymmetryGroup.trivial(), SymmetryGroup.from_name("C4"), VIEWS_PX)
+    middle = image[HEAD_PX + 24 + 120, 24 : 24 + 480].astype(int)
+    told = middle.max(axis=1) - middle.min(axis=1)
+    assert told[200:280].max() < 60 <= min(told[10:30].max(), told[450:470].max())
+    sky = image[HEAD_PX + 24 + 10 : HEAD_PX + 24 + 60, 24 + 200 : 24 + 280].astype(int)  # from above the rim shows it
+    assert np.ptp(sky, axis=2).max() < 60

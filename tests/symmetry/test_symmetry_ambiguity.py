@@ -209,6 +209,18 @@ def test_a_notch_that_faces_away_leaves_the_image_ambiguous(caster: RayCaster, w
     assert hidden <= set(away.alike.tolist()) and not shown & set(away.alike.tolist())
 
 
+@settings(max_examples=20)
+@given(azimuth=st.floats(-45, 45), elevation=st.floats(-60, 60), roll=st.floats(-180, 180))
+def test_where_everything_is_visible_only_the_exact_group_looks_alike(
+    caster: RayCaster, azimuth: float, elevation: float, roll: float
+) -> None:
+    tilt = to_matrix(from_axis_angle((1, 0, 0), np.radians(elevation)))
+    R = to_matrix(from_axis_angle((0, 0, 1), np.radians(roll))) @ tilt @ azimuthal_pose(azimuth)
+    for obj_id, exact in ((1, group("C1")), (2, group("C2"))):
+        seen = judged(caster, obj_id, R, exact, group("C12"))
+        assert seen.alike.tolist() == [seen.coset_true]
+
+
 def test_what_hides_the_notch_makes_the_image_ambiguous(caster: RayCaster) -> None:
     R = azimuthal_pose(0)
     assert judged(caster, 1, R, group("C1"), group("C2")).view_ambiguity == 0.5

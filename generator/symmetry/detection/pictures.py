@@ -25,11 +25,13 @@ from synthetless.io.meshes import TriangleMesh, read_mesh
 from synthetless.io.models import find_meshes
 from synthetless.io.parallel import each
 from synthetless.scenes.spec import Intrinsics
+from synthetless.symmetry.ambiguity import Cosets, see
+from synthetless.symmetry.canonical import CanonicalMap
 from synthetless.symmetry.detection.detect import measure
 from synthetless.symmetry.detection.distance import PIECE, Surface
 from synthetless.symmetry.detection.folder import DetectedFolder
 from synthetless.symmetry.detection.report import group_cells
-from synthetless.symmetry.detection.residual import GroupFit, moved, spread_elements
+from synthetless.symmetry.detection.residual import GroupFit, directions, moved, spread_elements
 from synthetless.symmetry.groups import SymmetryGroup
 from synthetless.symmetry.quaternions import Floats, normalise
 from synthetless.symmetry.table import SymmetryEntry, SymmetryTable
@@ -39,6 +41,7 @@ Colour = tuple[int, int, int]
 
 _TILE_PX, _HEAD_PX, _LEGEND_PX = 400, 34, 120
 _MARGIN_PX = 24
+_VIEWS, _SEEN_PX, _MAP_PX = 200, 100, 240
 _DISTANCE = 6.0  # of the camera, in diameters
 _DIRECTIONS = ((1.0, -1.4, 0.8), (-1.0, 0.9, -0.7), (0.25, -0.3, 1.0))  # from the part to the camera, z up
 _SAMPLES, _IMAGES = 8000, 16
@@ -70,6 +73,7 @@ def draw_detected(detected: DetectedFolder, to: Path, workers: int | None = None
             title=f"object {o.obj_id}",
             tolerance_percent=100 * o.detected.tolerance_mm / o.detected.diameter_mm,
             shown=tuple(f for f in (o.detected.answer, o.quasi or o.detected.next_larger) if f is not None),
+            has_quasi=o.quasi is not None,
         )
         for o in detected.objects
     ]
@@ -79,7 +83,8 @@ def draw_detected(detected: DetectedFolder, to: Path, workers: int | None = None
 def draw_table(table: SymmetryTable, models: Path, to: Path, workers: int | None = None) -> None:
     """Draw the objects of a symmetry table whose meshes a folder holds; arguments and errors as in `draw_detected`.
 
-    A quasi-symmetry group is drawn below the exact one: where the surface is coloured is the detail between them.
+    A quasi-symmetry group is drawn below the exact one: where the surface is coloured is the detail between them. Below
+    that is the viewing sphere, by how much of the group a view leaves open.
 
     Raises:
         UserError: the folder holds none of the table's objects.
@@ -95,6 +100,7 @@ def draw_table(table: SymmetryTable, models: Path, to: Path, workers: int | None
             f"object {obj_id}",
             _TOLERANCE_PERCENT,
             _groups_of(table.entries[obj_id]),
+            has_quasi=table.entries[obj_id].quasi is not None,
         )
         for obj_id, path in paths.items()
     ]
@@ -114,6 +120,7 @@ class _Task:
     tolerance_percent: float
     shown: tuple[GroupFit | SymmetryGroup, ...]
     tessellation_mm: float = TESSELLATION_MM
+    has_quasi: bool = False
 
 
 def _draw_all(tasks: list[_Task], workers: int | None) -> None:
@@ -128,7 +135,10 @@ def _draw(task: _Task) -> None:
         shown if isinstance(shown, GroupFit) else measure(mesh.vertices_mm, mesh.faces, mesh.diameter_mm, shown)
         for shown in task.shown
     ]
-    write_picture(task.target, picture(task.title, mesh, fits, tolerance_mm))
+    drawn = picture(task.title, mesh, fits, tolerance_mm)
+    if task.has_quasi and fits[-1].group.family != "SO(3)":
+        drawn = np.concatenate([drawn, views_left_open(mesh, fits[0].group, fits[-1].group, drawn.shape[1])])
+    write_picture(task.target, drawn)
 
 
 def picture(title: str, mesh: TriangleMesh, fits: Sequence[GroupFit], tolerance_mm: float) -> Image:
@@ -140,6 +150,52 @@ def picture(title: str, mesh: TriangleMesh, fits: Sequence[GroupFit], tolerance_
     views = _Views(mesh)
     rows = [views.row(fit, f"{title}   " if i == 0 else "", tolerance_mm) for i, fit in enumerate(fits)]
     return np.concatenate(rows)
+
+
+def views_left_open(mesh: TriangleMesh, exact: SymmetryGroup, quasi: SymmetryGroup, width_px: int) -> Image:
+    """The viewing sphere by which share of the cosets beside the true one a view leaves open, the object being
+    _SEEN_PX pixels large: (H, width_px, 3) RGB. An equal-area map (Hammer's), z up, x in the middle.
+
+    Raises:
+        UserError: the quasi-symmetry group is SO(3).
+    """
+    caster, center = RayCaster({("model", 0): (mesh.vertices_mm, mesh.faces)}), mesh.vertices_mm.mean(axis=0)
+    cosets, canonical_map = Cosets.of(quasi, exact), CanonicalMap(quasi)
+    seen_from = directions(_VIEWS)
+    shares = []
+    for direction in seen_from:
+        camera = _camera(mesh, -direction, center, _SEEN_PX, 2)
+        posed = PosedModel(0, camera.R, camera.t)
+        canonical = canonical_map(camera.R[None], camera.t[None])
+        seen = see(caster, camera.pinhole, posed, canonical.R_m2c[0], cosets)
+        shares.append((len(seen.alike) - 1) / (len(cosets) - 1))
+    image = np.full((_HEAD_PX + _MAP_PX + 2 * _MARGIN_PX, width_px, 3), 255, np.uint8)
+    inside, towards = _hammer(_MAP_PX)
+    _, nearest = cKDTree(seen_from).query(towards[inside])
+    area = image[_HEAD_PX + _MARGIN_PX :, _MARGIN_PX:][:_MAP_PX, : 2 * _MAP_PX]
+    area[inside] = _colours(np.array(shares)[nearest])
+    text = f"how many of the {len(cosets)} cosets of {exact.name} in {quasi.name} a view leaves open"
+    _write(image, f"{text}   z up, x in the middle   object {_SEEN_PX} pixels large", (10, 23))
+    left, top, height = 2 * _MAP_PX + 3 * _MARGIN_PX, _HEAD_PX + _MARGIN_PX, _MAP_PX
+    image[top : top + height, left : left + 20] = _colours(np.linspace(1, 0, height))[:, None]
+    cv2.rectangle(image, (left, top), (left + 19, top + height), _GREY, 1)
+    for share, word in ((1.0, "all"), (0.0, "the true one alone: the detail is visible")):
+        _write(image, word, (left + 32, round(top + (1 - share) * height) + 4))
+    return image
+
+
+def _hammer(height_px: int) -> tuple[NDArray[np.bool_], Floats]:
+    """Which pixels of a map (height_px, 2 height_px) are on it, and unit vectors (h, w, 3) of those directions."""
+    rows, columns = np.mgrid[:height_px, : 2 * height_px]
+    x = 2 * np.sqrt(2) * ((columns + 0.5) / height_px - 1)
+    y = np.sqrt(2) * (1 - 2 * (rows + 0.5) / height_px)
+    squared = 1 - (x / 4) ** 2 - (y / 2) ** 2
+    z = np.sqrt(squared)
+    longitude = 2 * np.arctan2(z * x, 2 * (2 * squared - 1))
+    up = np.clip(z * y, -1, 1)
+    across = np.sqrt(1 - up**2)
+    inside: NDArray[np.bool_] = (x**2 / 8 + y**2 / 2) < 1
+    return inside, np.stack([across * np.cos(longitude), across * np.sin(longitude), up], axis=-1)
 
 
 def write_picture(path: Path, image: Image) -> None:
@@ -244,17 +300,19 @@ class _Views:
             _line(image, pixels[first], pixels[last], axis.pen)
 
 
-def _camera(mesh: TriangleMesh, forward: Floats, center: Floats) -> _Camera:
-    """A camera that looks along `forward`, z up, and sees the whole part in the middle of the tile."""
+def _camera(
+    mesh: TriangleMesh, forward: Floats, center: Floats, side_px: int = _TILE_PX, margin_px: int = _MARGIN_PX
+) -> _Camera:
+    """A camera that looks along `forward`, z up, and sees the whole part in the middle of a square image."""
     right = normalise(np.cross(forward, [0.0, 0.0, 1.0]))
     R = np.stack([right, np.cross(forward, right), forward])
     t = np.array([0, 0, _DISTANCE * mesh.diameter_mm]) - R @ center
     seen = mesh.vertices_mm @ R.T + t
     flat = seen[:, :2] / seen[:, 2:]
     low, high = flat.min(axis=0), flat.max(axis=0)
-    focal = (_TILE_PX - 2 * _MARGIN_PX) / float((high - low).max())
-    cx, cy = _TILE_PX / 2 - focal * (low + high) / 2
-    return _Camera(Intrinsics(_TILE_PX, _TILE_PX, focal, focal, float(cx), float(cy)), R, t)
+    focal = (side_px - 2 * margin_px) / float((high - low).max())
+    cx, cy = side_px / 2 - focal * (low + high) / 2
+    return _Camera(Intrinsics(side_px, side_px, focal, focal, float(cx), float(cy)), R, t)
 
 
 def _axes_of(group: SymmetryGroup) -> list[_Axis]:

@@ -261,7 +261,7 @@ def elements_along_orbits(group: SymmetryGroup, points: Floats, step_mm: float) 
     local = points - np.array(group.offset_mm)
     if group.family == "SO(3)":
         counts = np.clip(4 * np.pi * np.sum(local**2, axis=1) / (2 * step_mm) ** 2, 24, 4000).astype(np.int64)
-        spheres = [minimal(normalise(point), _directions(n)) for point, n in zip(local, counts, strict=True)]
+        spheres = [minimal(normalise(point), directions(n)) for point, n in zip(local, counts, strict=True)]
         return counts, np.concatenate(spheres)
     axis = np.array(group.axis)
     radii = np.linalg.norm(np.cross(axis, local), axis=1)
@@ -281,7 +281,7 @@ def turns_beside(group: SymmetryGroup, angle_rad: float) -> Floats:
     return np.concatenate([from_axis_angle(axis, angles) for axis in axes])
 
 
-def _directions(n: int) -> Floats:
+def directions(n: int) -> Floats:
     """n directions (n, 3) spread evenly over the sphere (a Fibonacci spiral)."""
     i = np.arange(n) + 0.5
     z, angle = 1 - 2 * i / n, np.pi * (1 + np.sqrt(5)) * i
