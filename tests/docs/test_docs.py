@@ -60,6 +60,8 @@ CHANGED = (
         "1500 steps of 15 runs take long",
     ),
     (r"^synthetless (train|predict|compare) ", r"{torch} \1 ", "torch is not installed everywhere"),
+    (r"generate demo ", "generate configs/demo.yaml ", "the recipe that is small here"),
+    (r"recipes --copy demo$", r"\g<0> && cp configs/demo.yaml demo.yaml", "likewise"),
     (r"^make ", "make -o setup ", "the environment is there already"),
     (r"fetch tless --to \S+$", r"\g<0> --from {tless}", "a test has no network"),
     (r"fetch dtd --to \S+$", r"\g<0> --from {dtd}", "a test has no network"),
@@ -69,6 +71,7 @@ CHANGED = (
 NOT_RUN = (
     (r"make setup( PYTHON=.*)?", "makes the environment that this test runs in"),
     (r"source \.venv/bin/activate", "a page's commands find the environment's programs already"),
+    (r"python3\.11 -m venv .*|pip install 'PATH.*", "likewise; .ci/wheel does that"),
     (r"docker .*", "needs Docker; see test_docker.py"),
     (r"sudo (make system-libraries|apt-get .*)", "installs packages, as root"),
     (r"sbatch .*", "needs SLURM"),
