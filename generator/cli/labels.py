@@ -90,11 +90,9 @@ def ambiguity_command(
     For objects with a quasi-symmetry group. Images are not looked at: poses and meshes decide. Called again, it goes on
     where it was interrupted.
     """
-    from synthetless.dataset.ambiguity import name_quasi_symmetries, write_ambiguity
+    from synthetless.dataset.ambiguity import write_ambiguity
 
-    if symmetries is not None:
-        name_quasi_symmetries(dataset, symmetries, models, workers)
-    done = write_ambiguity(dataset, what, eps_mm, models, poses, workers)
+    done = write_ambiguity(dataset, what, eps_mm, models, poses, workers, symmetries)
     say(json.dumps(asdict(done)) if as_json else done)
 
 

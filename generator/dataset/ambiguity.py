@@ -108,6 +108,7 @@ def write_ambiguity(
     models: Path | None = None,
     with_poses: bool = False,
     workers: int | None = None,
+    symmetries: Path | None = None,
 ) -> AmbiguitySummary:
     """Put scene_gt_ambiguity.json into every scene folder of a labelled dataset.
 
@@ -118,11 +119,17 @@ def write_ambiguity(
         models: folder of the meshes, if they are not in the dataset.
         with_poses: also write the poses that look alike themselves.
         workers: processes; one per available core if None. They are spawned.
+        symmetries: a symmetry table, which may lack objects, whose quasi-symmetry groups are put into symmetries.json:
+            an entry's ``quasi``, or its group, where it has none. Labels stay as they are.
 
     Raises:
         UserError: there are no labels or no quasi-symmetry group, a mesh or an image's size cannot be found, or the
-            dataset is damaged or cannot be written.
+            dataset is damaged or cannot be written; the table is invalid, of other objects or of another exact group.
     """
+    if symmetries is not None:
+        table = _with_quasi_symmetries(root, symmetries)
+        AmbiguitySource.read(root, what, eps_mm, models, with_poses, table).header(_scenes(root))  # may refuse it
+        _put_symmetries(root, table, models, workers)
     source = AmbiguitySource.read(root, what, eps_mm, models, with_poses)
     scenes = _scenes(root)
     with locked(root):
@@ -140,20 +147,8 @@ def write_ambiguity(
     return _summary(source, scenes, len(wanted))
 
 
-def name_quasi_symmetries(root: Path, symmetries: Path, models: Path | None = None, workers: int | None = None) -> None:
-    """Put quasi-symmetry groups into a labelled dataset's symmetries.json. Its labels are those of the exact groups, so
-    they stay as they are.
-
-    Args:
-        root: the dataset's folder.
-        symmetries: a symmetry table, which may lack objects. An object's quasi-symmetry group is the entry's ``quasi``,
-            or, where it has none, its group.
-        models: folder of the models, if they are not in the dataset.
-        workers: as in ``write_ambiguity``.
-
-    Raises:
-        UserError: there are no labels, or the table is invalid, of other objects or of another exact group.
-    """
+def _with_quasi_symmetries(root: Path, symmetries: Path) -> SymmetryTable:
+    """A dataset's symmetry table with the quasi-symmetry groups of another one: an entry's ``quasi``, or its group."""
     table = _symmetries(root)
     entries = dict(table.entries)
     for obj_id, given in SymmetryTable.read(symmetries).entries.items():
@@ -164,11 +159,16 @@ def name_quasi_symmetries(root: Path, symmetries: Path, models: Path | None = No
             entries[obj_id] = _with_quasi(entries[obj_id], given)
         except UserError as error:
             raise UserError(f"{symmetries}: object {obj_id}: {error}") from None
-    if entries == dict(table.entries):
+    return replace(table, entries=entries)
+
+
+def _put_symmetries(root: Path, table: SymmetryTable, models: Path | None, workers: int | None) -> None:
+    """Make a table of the same exact groups the dataset's. Labels are those of the exact groups, so they stay."""
+    if table.digest() == _symmetries(root).digest():
         return
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / SYMMETRIES_FILE
-        replace(table, entries=entries).write(path)
+        table.write(path)
         if (root / DATASET_FILE).exists():
             relabel(root, path, workers=workers)
         else:
@@ -227,9 +227,10 @@ class AmbiguitySource:
         eps_mm: float | None = None,
         models: Path | None = None,
         with_poses: bool = False,
+        table: SymmetryTable | None = None,
     ) -> AmbiguitySource:
         """Find everything that a dataset's images are judged by; errors as in ``write_ambiguity``."""
-        table = _symmetries(root)
+        table = table or _symmetries(root)
         if not any(entry.quasi for entry in table.entries.values()):
             raise UserError(
                 f"{root / SYMMETRIES_FILE}: no object has a quasi-symmetry group; give a table that names one by "

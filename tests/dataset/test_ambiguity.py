@@ -22,7 +22,7 @@ from synthetless.annotation.raycast import RayCaster
 from synthetless.cli.commands import app
 from synthetless.dataset import Dataset
 from synthetless.dataset import ambiguity as module
-from synthetless.dataset.ambiguity import AmbiguitySource, name_quasi_symmetries, see_images, write_ambiguity
+from synthetless.dataset.ambiguity import AmbiguitySource, see_images, write_ambiguity
 from synthetless.dataset.reader import Scene
 from synthetless.dataset.relabel import adopt, relabel
 from synthetless.errors import UserError
@@ -253,11 +253,11 @@ def test_datasets_of_others(root: Path, tmp_path: Path) -> None:
     (tmp_path / "table.yaml").write_text(TABLE)
     adopt(root, symmetries=tmp_path / "exact.yaml", workers=1)
     labels = {path: text for path, text in contents(root).items() if not path.endswith("symmetries.json")}
-    name_quasi_symmetries(root, tmp_path / "table.yaml", workers=1)
-    assert labels.items() <= contents(root).items()
     with pytest.raises(UserError, match="not found; a BOP models folder"):
-        write_ambiguity(root, models=tmp_path, workers=1)
-    write_ambiguity(root, with_poses=True, workers=1)
+        write_ambiguity(root, models=tmp_path, workers=1, symmetries=tmp_path / "table.yaml")
+    assert not any(entry.quasi for entry in Dataset.open(root).symmetries.entries.values())
+    write_ambiguity(root, with_poses=True, workers=1, symmetries=tmp_path / "table.yaml")
+    assert labels.items() <= contents(root).items()
     assert json.loads((root / "ambiguity.json").read_text())["depth_images"]
     fields = ("obj_id", "cam_R_m2c_quasi", "coset_true", "cosets_alike", "eps_mm")
     for name, text in own.items():
@@ -390,11 +390,12 @@ def test_larger_groups_are_given_by_a_table_and_labels_stay(
     for text, message in (
         ("{1: {group: C3, quasi: D3}}", "the group is C3, but the labels are of C1"),
         ("{2: C4}", "does not contain the group"),
+        ("{3: SO(3)}", "cannot be sampled"),
         ("{9: C4}", "object 9 is none of the dataset's objects 1, 2, 3"),
     ):
         (tmp_path / "table.yaml").write_text(text)
         with pytest.raises(UserError, match=message):
-            name_quasi_symmetries(root, tmp_path / "table.yaml")
+            write_ambiguity(root, with_poses=True, workers=1, symmetries=tmp_path / "table.yaml")
     assert contents(root) == contents(judged)
 
 
