@@ -116,14 +116,15 @@ class BopExport(FolderExport):
             files["gt"][str(im_id)] = labels.gt
             files["gt_info"][str(im_id)] = labels.gt_info
             files["gt_canonical"][str(im_id)] = [self._moved(label) for label in labels.gt_canonical]
-            rgb, content = self._rgb(paths.root / image.entry["file_name"])
-            yield f"{scene}/rgb/{im_id:06d}{rgb}", content
-            yield from self._depth(paths, labels.im_id, f"{scene}/depth/{im_id:06d}.png")
-            for gt_id in range(len(labels.gt)):
-                for folder, mask in (("mask", paths.mask), ("mask_visib", paths.mask_visib)):
-                    if (path := mask(labels.im_id, gt_id)).exists():
-                        yield f"{scene}/{folder}/{im_id:06d}_{gt_id:06d}.png", read_bytes(path)
+            source = paths.root / image.entry["file_name"]
+            rgb = source.suffix if self.jpg is None else ".jpg"
             images.append({**image.entry, "id": im_id, "file_name": f"rgb/{im_id:06d}{rgb}"})
+            if source.parent.is_dir():  # a recipe's outputs may lack what is not of interest
+                yield f"{scene}/rgb/{im_id:06d}{rgb}", self._picture(source)
+            yield from self._depth(paths, labels.im_id, f"{scene}/depth/{im_id:06d}.png")
+            for folder, mask in (("mask", paths.mask), ("mask_visib", paths.mask_visib)):
+                for gt_id in range(len(labels.gt) if (paths.root / folder).is_dir() else 0):
+                    yield f"{scene}/{folder}/{im_id:06d}_{gt_id:06d}.png", read_bytes(mask(labels.im_id, gt_id))
             annotations += [{**annotation, "image_id": im_id} for _, annotation in image.visible]
             categories = {category["id"]: self._named(category) for category in coco["categories"]} | categories
             if self.xyz_crops:
@@ -213,11 +214,11 @@ class BopExport(FolderExport):
         corners = [[u + self.pixel_centre, v + self.pixel_centre] for u, v in label["bbox3d_corners_2d"]]
         return {**label, "bbox3d_corners_2d": corners}
 
-    def _rgb(self, path: Path) -> tuple[str, bytes | Path]:
-        """Suffix and content of an image's file."""
+    def _picture(self, path: Path) -> bytes | Path:
+        """The file of a colour image: as it is, or a PNG as JPEG."""
         if self.jpg is None or path.suffix == ".jpg":
-            return path.suffix, path
-        return ".jpg", encode_jpeg(decode_rgb(read_bytes(path), path), self.jpg)
+            return path
+        return encode_jpeg(decode_rgb(read_bytes(path), path), self.jpg)
 
     def _camera(self) -> dict[str, Any]:
         """Content of camera.json: the dataset's, or else its first image's camera."""

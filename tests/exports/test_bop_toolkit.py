@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import valid_dataset
 from bop_toolkit import NAME, SPLIT_NAME, SPLIT_TYPE, Toolkit
 from numpy.typing import NDArray
 from trees import contents
@@ -167,12 +168,9 @@ def _score_the_truth(toolkit: Toolkit, split_type: str, fewest: int) -> None:
 def pbr(toolkit: Toolkit, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A dataset with images as large as those of train_pbr of T-LESS, and its export by that name."""
     camera = {"width": 720, "height": 540, "fx": 1075.65, "fy": 1073.9, "cx": 355.7, "cy": 262.4}
-    made = _generate(
-        "builtin",
-        tmp_path_factory.mktemp("pbr") / "d",
-        "labels.visibility_delta_mm=0",
-        *(f"camera.{key}={value}" for key, value in camera.items()),
-    )
+    made = tmp_path_factory.mktemp("pbr") / "d"
+    changes = [f"camera.{key}={value}" for key, value in camera.items()]
+    valid_dataset.write_dataset(made, ROOT / "assets" / "parts", ["images=4", "camera.distance_m=[0.6, 0.8]", *changes])
     shutil.rmtree(toolkit.root, ignore_errors=True)
     return made, export_bop(made, toolkit.folder, NAME, jpg=90, pixel_centre=0.5, scenes=2, workers=1)
 

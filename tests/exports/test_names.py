@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+import trimesh
 import valid_dataset
 import yaml
 
@@ -61,10 +62,12 @@ def test_names_that_come_later_reach_the_exports(valid: Path, tmp_path: Path) ->
     assert report.valid, report.lines()
 
 
-def test_detection_takes_names_from_files_or_from_names_yaml(parts: Path, tmp_path: Path) -> None:
+def test_detection_takes_names_from_files_or_from_names_yaml(tmp_path: Path) -> None:
     (tmp_path / "cad").mkdir()
-    for obj_id, name in ((1, "arm"), (3, "box")):
-        shutil.copy(parts / f"obj_{obj_id:06d}.ply", tmp_path / "cad" / f"{name}.ply")
+    for name, length in (("arm", 30), ("box", 40)):
+        corners = [[0, 0, 0], [length, 0, 0], [0, 20, 0], [0, 0, 10]]
+        wedge = trimesh.Trimesh(corners, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+        wedge.export(tmp_path / "cad" / f"{name}.ply")
     for yaml_text, expected in ((None, ["arm", "box"]), ("2: fuse", ["arm", "fuse"])):
         if yaml_text:
             (tmp_path / "cad" / "names.yaml").write_text(yaml_text)

@@ -99,7 +99,10 @@ def test_a_model_without_symmetry_stays_as_it_is(tmp_path: Path) -> None:
     assert read_recentrings(tmp_path / "m")[1].is_none
 
 
-def test_the_command_says_who_refuses_and_carries_poses_back(detected: DetectedFolder, tmp_path: Path) -> None:
+def test_the_command_says_who_refuses_and_carries_poses_back(
+    detected: DetectedFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("synthetless.symmetry.detection.detect_folder", lambda *_: detected)  # it takes seconds
     run = CliRunner().invoke
     detect = ["symmetries", "detect", str(detected.folder), "--workers", "1", "--models-out"]
     told = run(app, [*detect, str(tmp_path / "plain")])
