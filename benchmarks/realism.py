@@ -1,6 +1,6 @@
 """How objects lie in a recipe's drops, beside real T-LESS test images, and how bright the pictures of datasets are.
 
-    python -m benchmarks.realism configs/tless_bop.yaml --models DIR
+    python -m benchmarks.realism configs/tless_bin.yaml --models DIR
     python -m benchmarks.realism --pictures DATASET ...
 
 Of recipes, physics and ray casting alone, nothing is rendered: 200 drops of 10 objects take about 4 minutes of one
@@ -158,7 +158,7 @@ def main() -> None:
         print(f"\n{path}")
         for name, value in rows[str(path)].items():
             print(f"  {name:48} {value}")
-    recipes = arguments.recipe or ([] if arguments.pictures else [ROOT / "configs" / "tless_bop.yaml"])
+    recipes = arguments.recipe or ([] if arguments.pictures else [ROOT / "configs" / "tless_bin.yaml"])
     for path in recipes:
         recipe = load_recipe(path, [*sources, *views, *arguments.set])
         tasks = [Task(recipe.model_dump_json(), arguments.first + number) for number in range(arguments.drops)]

@@ -56,7 +56,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("symmetries ''", {"detect", "show"}),
         ("export ''", {"coco", "webdataset"}),
         ("fetch ''", {"tless", "dtd"}),
-        ("generate tl", {"tless_bop"}),
+        ("generate tless_bo", {"tless_bop"}),
         ("relabel out/demo --scheme ''", {"pitteri2019", "atlas"}),
         ("relabel out/demo --scheme a", {"atlas"}),
     ],
