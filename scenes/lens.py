@@ -31,6 +31,7 @@ _LEAST_STRETCH = 0.05
 _FARTHEST = 100.0
 """Distance from the axis up to which points of the plane z = 1 are considered: 89.4 degrees."""
 _NO_TERM = 1e-9
+_GRID = 129
 _MARGIN_PX = 4
 """Of the pinhole around what the frame shows: the outermost pixels are interpolated from so far outside."""
 _MOST_PIXELS = 16
@@ -168,7 +169,9 @@ def pinhole_around(camera: Intrinsics) -> Intrinsics:
     """The pinhole that sees all that a camera sees, at least as finely; without a lens, the camera itself."""
     if camera.distortion == NO_DISTORTION:
         return camera
-    straight = straight_points(camera)
+    # A grid will do: what is shown is bounded by what the border shows, and between its points by the margin.
+    columns, rows = (np.unique(np.linspace(0, side - 1, _GRID).round()) for side in (camera.width, camera.height))
+    straight = np.stack(directions(camera, columns, rows), axis=-1)
     a, b, c = jacobian(straight, camera.distortion)
     scale = max(1.0, float((np.hypot((a - c) / 2, b) + (a + c) / 2).max()))
     fx, fy = scale * camera.fx, scale * camera.fy

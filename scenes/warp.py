@@ -42,8 +42,11 @@ def warped(render: Light, camera: Intrinsics) -> Light:
     """
     samples = _samples(camera)
     picture = np.zeros((camera.height, camera.width, render.shape[2]), dtype=np.float32)
-    for x, y, weight in samples.taps:
-        picture += weight * cv2.remap(render, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    for i, weight_i in _NODES:
+        for j, weight_j in _NODES:
+            x, y = samples.centre + np.float32(i) * samples.first + np.float32(j) * samples.second
+            sample = cv2.remap(render, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+            picture += np.float32(weight_i * weight_j) * sample
     around = np.ones((samples.around_px, samples.around_px), np.uint8)
     x, y = samples.centre
     low, high = (
@@ -59,13 +62,14 @@ class _Samples:
     """Where in the render the pixels of the picture are sampled.
 
     Attributes:
-        taps: columns and rows (H, W) of each sample, and its weight.
-        centre: those of the pixels' centres.
+        centre: (2, H, W) columns and rows of the pixels' centres.
+        first, second: (2, H, W) from there to samples one standard deviation away.
         around_px: side of a square of the render that holds a pixel's samples and what they are interpolated from.
     """
 
-    taps: tuple[tuple[Light, Light, np.float32], ...]
-    centre: tuple[Light, Light]
+    centre: Light
+    first: Light
+    second: Light
     around_px: int
 
 
@@ -81,11 +85,10 @@ def _samples(camera: Intrinsics) -> _Samples:
     values, vectors = np.linalg.eigh(inverse)
     lacking = np.sqrt(np.maximum(_FILTER_VARIANCE_PX2 * (values * values - 1), 0))
     first, second = np.moveaxis(vectors * lacking[..., None, :], -1, 0)
-    taps = []
-    for i, weight_i in _NODES:
-        for j, weight_j in _NODES:
-            x, y = np.moveaxis((centre + i * first + j * second).astype(np.float32), -1, 0)
-            taps.append((np.ascontiguousarray(x), np.ascontiguousarray(y), np.float32(weight_i * weight_j)))
-    x, y = np.moveaxis(centre.astype(np.float32), -1, 0)
     reach_px = 1 + math.ceil(_NODES[-1][0] * float(lacking.max()) * math.sqrt(2))
-    return _Samples(tuple(taps), (np.ascontiguousarray(x), np.ascontiguousarray(y)), 2 * reach_px + 1)
+    return _Samples(_planes(centre), _planes(first), _planes(second), 2 * reach_px + 1)
+
+
+def _planes(places: NDArray[np.float64]) -> Light:
+    """(2, H, W) of (H, W, 2)."""
+    return np.ascontiguousarray(np.moveaxis(places, -1, 0), dtype=np.float32)
