@@ -45,7 +45,7 @@ from synthetless.io.images import (
 from synthetless.io.models import load_models
 from synthetless.scenes.camera import extrinsics, settled_centre
 from synthetless.scenes.sampling import sample_container, sample_surroundings
-from synthetless.scenes.spec import ContainerSpec, SceneSpec
+from synthetless.scenes.spec import ContainerSpec
 from synthetless.symmetry import SymmetryTable
 from synthetless.validation.images import (
     EXACT,
@@ -95,15 +95,10 @@ def check_specs(source: Source, scene: SceneRecords, plans: Sequence[ImagePlan])
         if plan is not None and (spec.scene.drop, spec.view) != (plan.drop, plan.view):
             shown = f"shows drop {spec.scene.drop}, view {spec.view}"
             yield Finding("spec", path, f"{shown}; this image is of drop {plan.drop}, view {plan.view}", im_id)
-        if plan is not None and spec.sensor != planned_sensor(source.recipe, plan):
-            yield Finding("spec", path, "records another sensor than the recipe draws for this image", im_id)
-        if not _is_surrounded_as_drawn(source.recipe, spec.scene):
-            yield Finding("spec", path, "records other surroundings than the recipe draws for this drop", im_id)
-        containers = source.recipe.release.container
-        if spec.scene.container != sample_container(containers, source.recipe.seed, spec.scene.drop):
-            yield Finding("spec", path, "records another container than the recipe draws for this drop", im_id)
-        if plan is not None and spec.depth_sensor != planned_depth_sensor(source.recipe, plan):
-            yield Finding("spec", path, "records another depth sensor than the recipe draws for this image", im_id)
+        if plan is not None:
+            yield from (
+                Finding("spec", path, message, im_id) for message in _drawn_otherwise(source.recipe, spec, plan)
+            )
         fault = incoherence(spec)
         if fault:
             yield Finding("spec", path, fault, im_id)
@@ -111,12 +106,19 @@ def check_specs(source: Source, scene: SceneRecords, plans: Sequence[ImagePlan])
             yield from _check_poses(scene, spec)
 
 
-def _is_surrounded_as_drawn(recipe: Recipe, scene: SceneSpec) -> bool:
-    """Whether room and panorama are those of the plan; which panorama it is, the folder, which may be gone, decides."""
-    recorded = scene.room, scene.environment
-    file = scene.environment.file if scene.environment else ""
-    offered = () if recipe.light.environments is None else (file,)
-    return recorded == sample_surroundings(recipe.light, offered, recipe.seed, scene.drop)
+def _drawn_otherwise(recipe: Recipe, spec: ImageSpec, plan: ImagePlan) -> Iterator[str]:
+    """What is recorded of an image and does not depend on the models, but differs from what the recipe draws for it."""
+    scene = spec.scene
+    if spec.sensor != planned_sensor(recipe, plan):
+        yield "records another sensor than the recipe draws for this image"
+    # Which panorama it is depends on the folder, which may be gone.
+    offered = () if recipe.light.environments is None else (scene.environment.file if scene.environment else "",)
+    if (scene.room, scene.environment) != sample_surroundings(recipe.light, offered, recipe.seed, plan.drop):
+        yield "records other surroundings than the recipe draws for this drop"
+    if scene.container != sample_container(recipe.release.container, recipe.seed, plan.drop):
+        yield "records another container than the recipe draws for this drop"
+    if spec.depth_sensor != planned_depth_sensor(recipe, plan):
+        yield "records another depth sensor than the recipe draws for this image"
 
 
 def incoherence(spec: ImageSpec) -> str | None:

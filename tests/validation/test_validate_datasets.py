@@ -109,6 +109,16 @@ def test_surroundings_are_checked(tmp_path: Path, parts: Path) -> None:
             lines[IMAGE]["scene"]["room"][key] = kept
 
 
+@pytest.mark.parametrize("asked", [(), ("light.room=ranges", "release.container=box")])
+def test_a_drop_that_is_none_is_told(tmp_path: Path, parts: Path, asked: tuple[str, ...]) -> None:
+    root = tmp_path / "d"
+    valid_dataset.write_dataset(root, parts, (*asked, "outputs=[]"))
+    with Victim(root).specs() as lines:
+        lines[IMAGE]["scene"]["drop"] = -1
+    found = {(f.kind, f.file.name) for f in validate(root, workers=1).findings if f.image == IMAGE}
+    assert ("spec", "scene_spec.jsonl") in found
+
+
 def test_textures_are_carried_along_and_checked(tmp_path: Path, parts: Path) -> None:
     models, root = tmp_path / "models", tmp_path / "d"
     shutil.copytree(parts, models)
