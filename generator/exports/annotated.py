@@ -93,6 +93,8 @@ def read_scene_coco(scene: ScenePaths) -> dict[str, Any]:
     Raises:
         UserError: it is missing or damaged.
     """
+    if not scene.scene_gt_coco.exists():
+        raise UserError(f"{scene.scene_gt_coco}: not found; bop_toolkit's calc_gt_coco.py writes it")
     coco = read_json(scene.scene_gt_coco)
     validated(SceneFile, coco, scene.scene_gt_coco)
     return coco
