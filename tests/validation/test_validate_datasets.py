@@ -246,7 +246,7 @@ def test_a_report_keeps_a_few_faults_of_each_kind_and_counts_all(valid: Path, tm
         ("nowhere", None, "no such dataset folder"),
         ("", None, r"no dataset\.json; give a folder that generate filled"),
         ("d", "coco.json", r"coco\.json: no such export"),
-        ("d", "models", "holds no shards"),
+        ("d", "models", "is no export"),
     ],
 )
 def test_a_wrong_request_is_refused(valid: Path, path: str, export: str | None, message: str) -> None:
