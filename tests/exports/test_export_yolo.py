@@ -156,6 +156,7 @@ def test_a_label_of_other_symmetries_is_named(valid: Path, tmp_path: Path) -> No
 
 def test_a_dataset_of_others_is_told_what_it_lacks(dataset: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(dataset, tmp_path / "d")
+    (copy / "dataset.json").unlink()
     (copy / "train_synthetless" / "000002" / "scene_gt_coco.json").unlink()
     with pytest.raises(UserError, match=r"000002/scene_gt_coco\.json: not found; bop_toolkit's calc_gt_coco\.py"):
         export_yolo(copy, tmp_path / "y", workers=1)
