@@ -258,7 +258,9 @@ def _table(seen: Observations, recipe: Recipe) -> Iterator[Distribution]:
 
 def _image(seen: Observations, recipe: Recipe) -> Iterator[Distribution]:
     low, high = recipe.render.exposure
-    if seen.luminance.size:
+    if recipe.sensor is not None:  # over-exposure, vignetting and shoulder come after the bounds
+        yield _histogram("luminance", "image", "Mean luminance, as displayed", seen.luminance, (0.0, 1.0))
+    elif seen.luminance.size:
         kept = bool((seen.luminance > low - 0.02).all() and (seen.luminance < high + 0.02).all())
         edges = np.linspace(0, 1, _BINS + 1)
         asked, p_value = f"within {low:g} to {high:g}", float(kept)

@@ -100,6 +100,27 @@ def test_containers_come_by_their_shares_and_what_is_set_down_is_not_taken_for_d
     assert found["release"].values < 0.7 * sum(found["classes"].counts)
 
 
+def test_rooms_and_materials_are_held_against_what_was_asked() -> None:
+    overrides = ["light.room=ranges", "objects.metallic=[0, 0.5]", "objects.grey_scale=linear", "sensor=ranges"]
+    recipe = load_recipe(None, overrides)
+    found = _verdicts(_seen(recipe, drops=500), recipe)
+    assert {key for key, each in found.items() if each.verdict == "differs"} == set()
+    asked = {
+        "room_side_m",
+        "room_height_m",
+        "soft_strength",
+        "soft_azimuth_deg",
+        "soft_lamps",
+        "object_metallic",
+        "grey",
+    }
+    assert {found[key].verdict for key in asked} == {"as asked"}
+    assert found["luminance"].verdict == "not prescribed", "the sensor may over-expose"
+    other = load_recipe(None, [*overrides, "light.room.lamp_strength=[0.1, 0.4]", "objects.metallic=[0.1, 0.5]"])
+    found = _verdicts(_seen(other, drops=500), recipe)
+    assert {key for key, each in found.items() if each.verdict == "differs"} == {"soft_strength", "object_metallic"}
+
+
 def test_release_rotations_that_are_not_uniform_are_found(by_default: Observations) -> None:
     upright = [s for s in by_default.drops if abs(s.objects[0].release.rotation_wxyz[0]) < 0.5]
     assert _verdicts(replace(by_default, drops=upright), Recipe())["release"].verdict == "differs"
