@@ -56,7 +56,7 @@ def main() -> None:
             for name, (settings, encode) in CANDIDATES.items():
                 renderer.session.configure(settings)
                 began = time.process_time()
-                linear = scene.render(0)
+                linear = renderer.render(scene, settled, 0)
                 spent = time.process_time() - began
                 gain = exposure_gain(linear, recipe.render.exposure)
                 content = encode(tonemap(linear, gain))

@@ -1,8 +1,9 @@
 """Where the time of an image goes: ``python -m benchmarks.throughput [--models DIR] [--textures DIR] [--images 12]``.
 
 One worker with one thread makes images of the T-LESS recipe, 720x540 with 10 objects, and commits them to a temporary
-folder. Stages are wall time, from Python's profiler and from Cycles' own log; the share of the time that is not Cycles'
-sampling and denoising is what this project can answer for. Prints a table, writes benchmarks/results/throughput.json.
+folder. Stages are CPU time of the process, from Python's profiler, and within Cycles shared out as its own log says;
+the share of the time that is not sampling and denoising is what this project can answer for. Prints a table, writes
+benchmarks/results/throughput.json.
 """
 
 from __future__ import annotations
@@ -27,6 +28,9 @@ PHASES = {
     "physics": [("physics.py", "settle"), ("drop.py", "_collider")],
     "build": [("render.py", "scene")],
     "annotate": [("raycast.py", "annotate")],
+    "guides": [("guides.py", "make_guides")],
+    "cycles": [("render.py", "_rendered")],
+    "denoise": [("denoise.py", "denoise")],
     "develop": [("color.py", "exposure_gain"), ("color.py", "picture")],
     "encode": [("store.py", "_encode")],
     "commit": [("store.py", "commit")],
@@ -43,8 +47,9 @@ def main() -> None:
     options.add_argument("--views", type=int, default=4, help="images of one drop")
     options.add_argument("--quality", default="standard")
     options.add_argument("--device", default="cpu")
+    options.add_argument("--set", nargs="*", default=[], help="more settings of the recipe, such as render.samples=12")
     arguments = options.parse_args()
-    settings = [f"camera.views_per_drop={arguments.views}", f"render.quality={arguments.quality}"]
+    settings = [f"camera.views_per_drop={arguments.views}", f"render.quality={arguments.quality}", *arguments.set]
     stages = measure(tless_recipe(arguments, *settings), arguments.images, arguments.device)
     total = sum(stages.values()) - stages["start"]
     for name, seconds in stages.items():
@@ -64,9 +69,9 @@ def measure(recipe: Recipe, images: int, wanted: str) -> dict[str, float]:
         log = Path(folder) / "blender.log"
         sources = load_sources(recipe)
         dataset = DatasetStore.open(Path(folder) / "dataset", recipe, sources.models, sources.scenery_digest)
-        began = time.perf_counter()
+        began = time.process_time()
         renderer = DropRenderer(recipe, sources, 1, devices.take(devices.choose(wanted)), log)
-        stages = {"start": time.perf_counter() - began}
+        stages = {"start": time.process_time() - began}
         # What is made once for each model, whatever the number of images, is made now.
         renderer.session.configure(recipe.render.model_copy(update={"samples": 1, "denoiser": "none"}))
         for drop in range(-(-images // views)):
@@ -74,20 +79,23 @@ def measure(recipe: Recipe, images: int, wanted: str) -> dict[str, float]:
         renderer.session.configure(recipe.render)
         log.unlink()
 
-        profile = cProfile.Profile()
-        began = time.perf_counter()
+        profile = cProfile.Profile(time.process_time)
+        began = time.process_time()
         profile.enable()
         for number in range(0, images, views):
             plans = [plan_image(n, views) for n in range(number, min(number + views, images))]
             for image in renderer.make(number // views, plans):
                 dataset.commit(image)
         profile.disable()
-        total = time.perf_counter() - began
+        total = time.process_time() - began
         sync, cycles = _logged(log)
         log.unlink()
-        share = _share_of_sampling(renderer, log, images, views)
         stages |= _profiled(profile)
-        stages |= {"sync": sync, "sampling": share * cycles, "denoise": (1 - share) * cycles}
+        spent = stages.pop("cycles")
+        traced = spent * cycles / (sync + cycles)
+        share = 1.0 if recipe.render.denoiser == "guided" else _share_of_sampling(renderer, log, images, views)
+        stages |= {"sync": spent - traced, "sampling": share * traced}
+        stages["denoise"] += (1 - share) * traced
     return stages | {"other": total - (sum(stages.values()) - stages["start"])}
 
 
@@ -106,14 +114,14 @@ def _share_of_sampling(renderer: DropRenderer, log: Path, images: int, views: in
         with renderer.session.scene(spec, settled) as scene:
             for k, variant in enumerate([settings.model_copy(update={"denoiser": "none"}), settings]):
                 renderer.session.configure(variant)
-                scene.render(0)
+                renderer.render(scene, settled, 0)
                 seconds[k] += _logged(log)[1]
                 log.unlink()
     return min(seconds[0] / seconds[1], 1.0)
 
 
 def _logged(log: Path) -> tuple[float, float]:
-    """Cycles' own stages in its log, seconds: until the first sample, and from there until the image is denoised."""
+    """Cycles' own stages in its log, seconds passed: until the first sample, and from there to the denoised image."""
     before = after = 0.0
     for minutes, seconds, what in _LINE.findall(log.read_text(errors="replace")):
         now = 60 * int(minutes) + float(seconds)

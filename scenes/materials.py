@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,21 @@ from synthetless.scenes.srgb import linear_of_levels
 
 _COLOURS = "colours"
 """Name of the attribute that holds the colours of a mesh's vertices."""
+
+
+@dataclass(frozen=True, eq=False)
+class TableTexture:
+    """What covers a table, as it is rendered.
+
+    Attributes:
+        plane: how it lies there.
+        pixels: (H, W, 3) of a tile, sRGB, first row on top.
+        seamless: whether tiles are repeated as they are, or else mirrored.
+    """
+
+    plane: PlaneSpec
+    pixels: NDArray[np.uint8]
+    seamless: bool
 
 
 def plastic(bpy: Any, material: Material, texture: Any = None) -> Any:
@@ -40,33 +56,37 @@ def add_colours(mesh: Any, colours: SurfaceColours) -> None:
         mesh.uv_layers.new(name="uv").data.foreach_set("uv", colours.corner_uv.ravel())
 
 
-def textured(bpy: Any, plane: PlaneSpec, image: Any, seamless: bool) -> Any:
+def textured(bpy: Any, texture: TableTexture) -> Any:
     """A bpy material that repeats an image over the surface; one that is not seamless is mirrored at its borders."""
     made, nodes, links = _empty_material(bpy, "table")
-    shader = _surface(nodes, links, plane.roughness, plane.specular)
-    texture = nodes.new("ShaderNodeTexImage")
-    texture.image = image
-    texture.extension = "REPEAT" if seamless else "MIRROR"
-    links.new(texture.outputs["Color"], shader.inputs[0])
+    shader = _surface(nodes, links, texture.plane.roughness, texture.plane.specular)
+    node = nodes.new("ShaderNodeTexImage")
+    node.image = new_image(bpy, texture.pixels)
+    node.extension = "REPEAT" if texture.seamless else "MIRROR"
+    links.new(node.outputs["Color"], shader.inputs[0])
     return made
 
 
-def add_table(bpy: Any, collection: Any, plane: PlaneSpec, size_m: float, material: Any, aspect: float) -> Any:
-    """Add the square table in z = 0 to a bpy collection; ``aspect`` is the texture's width over its height."""
+def add_table(bpy: Any, collection: Any, texture: TableTexture, size_m: float) -> Any:
+    """Add the square table in z = 0 to a bpy collection."""
     half = size_m / 2
     corners = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
     mesh = bpy.data.meshes.new("table")
     mesh.from_pydata([(x, y, 0.0) for x, y in corners], [], [(0, 1, 2, 3)])
     uv = mesh.uv_layers.new(name="uv")
-    uv.data.foreach_set("uv", table_uv(plane, corners, aspect).astype(np.float32).ravel())
-    mesh.materials.append(material)
+    aspect = texture.pixels.shape[1] / texture.pixels.shape[0]
+    uv.data.foreach_set("uv", table_uv(texture.plane, corners, aspect).astype(np.float32).ravel())
+    mesh.materials.append(textured(bpy, texture))
     table = bpy.data.objects.new("table", mesh)
     collection.objects.link(table)
     return table
 
 
 def table_uv(plane: PlaneSpec, points_m: NDArray[np.float64], aspect: float) -> NDArray[np.float64]:
-    """(N, 2) texture coordinates of (N, 2) points of the table: turned, scaled to tiles, and shifted."""
+    """(N, 2) texture coordinates of (N, 2) points of the table: turned, scaled to tiles, and shifted.
+
+    ``aspect`` is the texture's width over its height.
+    """
     angle = math.radians(plane.rotation_deg)
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     uv: NDArray[np.float64] = points_m @ turn.T / (plane.tile_m * np.array([aspect, 1.0])) + plane.shift

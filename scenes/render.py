@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 import os
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,10 @@ from synthetless.errors import UserError
 from synthetless.scenes import blender, camera, lights, materials
 from synthetless.scenes.blender import RenderDevice
 from synthetless.scenes.container import container_mesh
+from synthetless.scenes.denoise import Denoiser, Guides
 from synthetless.scenes.environments import load_panorama
 from synthetless.scenes.lens import pinhole_around
+from synthetless.scenes.materials import TableTexture
 from synthetless.scenes.rotations import matrix
 from synthetless.scenes.settings import RenderSettings, TableSettings
 from synthetless.scenes.spec import AmbientLight, EnvironmentSpec, Intrinsics, Mesh, Pose, Role, SceneSpec
@@ -65,7 +68,13 @@ class BlenderSession:
 
     def configure(self, settings: RenderSettings) -> None:
         """Render in this way from now on."""
+        self.settings = settings
         _configure(self.bpy.context.scene, settings)
+
+    @functools.cached_property
+    def denoiser(self) -> Denoiser:
+        """The guided one; started when it is first used."""
+        return Denoiser(self.threads)
 
     @contextlib.contextmanager
     def scene(self, spec: SceneSpec, settled: Sequence[Pose]) -> Iterator[BlenderScene]:
@@ -88,7 +97,8 @@ class BlenderSession:
                 lights.add_room(self.bpy, collection, spec.room, spec.ambient, centre_m, self.settings.bounces)
             if spec.environment is not None:
                 self._add_panorama(bpy_scene.world, spec.environment, spec.ambient)
-            self._add_table(collection, spec, centre_m)
+            cover = self._table_texture(spec, centre_m)
+            materials.add_table(self.bpy, collection, cover, self.table.size_m)
             if spec.container is not None:
                 container = self.bpy.data.objects.new("container", _load_mesh(self.bpy, container_mesh(spec.container)))
                 container.data.materials[0] = materials.plastic(self.bpy, spec.container.material)
@@ -105,11 +115,11 @@ class BlenderSession:
             bpy_scene.camera = self.bpy.data.objects.new("camera", data)
             collection.objects.link(bpy_scene.camera)
             camera.set_intrinsics(bpy_scene, bpy_scene.camera, self.pinhole)
-            yield BlenderScene(self, spec, centre_m)
+            yield BlenderScene(self, spec, centre_m, cover)
         finally:
             blender.clear(self.bpy, keep={*self._loaded.values(), *self._textures.values()})
 
-    def _add_table(self, collection: Any, spec: SceneSpec, centre_m: NDArray[np.float64]) -> None:
+    def _table_texture(self, spec: SceneSpec, centre_m: NDArray[np.float64]) -> TableTexture:
         plane, texture = spec.plane, spec.plane.texture
         is_seamless = True
         if isinstance(texture, PhotoTexture):
@@ -123,10 +133,7 @@ class BlenderSession:
                 plane = replace(plane, tile_m=texel_m * len(pixels))
         else:
             pixels = procedural_image(texture)
-        image = materials.new_image(self.bpy, pixels)
-        material = materials.textured(self.bpy, plane, image, is_seamless)
-        aspect = pixels.shape[1] / pixels.shape[0]
-        materials.add_table(self.bpy, collection, plane, self.table.size_m, material, aspect)
+        return TableTexture(plane, pixels, is_seamless)
 
     def _add_panorama(self, world: Any, environment: EnvironmentSpec, ambient: AmbientLight) -> None:
         if self.panoramas is None:
@@ -159,31 +166,70 @@ class BlenderScene:
         session: where it is built.
         spec: what it was built from.
         centre_m: (3,) centre of its objects, world frame.
+        texture: of the table.
     """
 
     session: BlenderSession
     spec: SceneSpec
     centre_m: NDArray[np.float64]
+    texture: TableTexture
 
     def extrinsics(self, view: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """R_w2c (3, 3) and t_w2c (3,) in metres of the given view."""
         return camera.extrinsics(self.spec.views[view], self.centre_m)
 
-    def render(self, view: int) -> NDArray[np.float32]:
-        """Linear image (H, W, 3), Rec. 709 primaries, of the given view."""
+    def render(self, view: int, guides: Callable[[], Guides] | None = None) -> NDArray[np.float32]:
+        """Linear image (H, W, 3), Rec. 709 primaries, of the given view.
+
+        Args:
+            view: its number.
+            guides: gives those of the denoiser, for the session's pinhole, where the settings ask for the guided one.
+
+        Raises:
+            ValueError: they are asked for, but not given.
+            BlenderError: the denoiser cannot be used.
+        """
+        light = self._denoised(view, guides) if self.session.settings.denoiser == "guided" else self._rendered(view)
+        if self.session.pinhole is self.session.intrinsics:
+            return light
+        return warped(light, self.session.intrinsics)
+
+    def _denoised(self, view: int, guides: Callable[[], Guides] | None) -> NDArray[np.float32]:
+        """The image of the session's pinhole, guided."""
+        if guides is None:
+            raise ValueError("the guided denoiser needs guides")
+        known = guides()
+        if known.known.all():
+            return self.session.denoiser.denoise(self._rendered(view), known)
+        passes = self._rendered(view, with_albedo=True)
+        return self.session.denoiser.denoise(passes[..., :3], known.completed(passes[..., 3:]))
+
+    def _rendered(self, view: int, with_albedo: bool = False) -> NDArray[np.float32]:
+        """The image as Cycles gives it; if wanted, the albedo that it sampled as three more channels."""
         scene = self.session.bpy.context.scene
+        # With one lamp there is nothing to choose. What was made with Blender's own denoiser was made with the tree.
+        chooses = self.session.settings.denoiser != "guided" or self.spec.room is not None
+        scene.cycles.use_light_tree = lights.uses_tree(self.spec) and chooses
+        scene.view_layers[0].cycles.denoising_store_passes = with_albedo
+        scene.render.image_settings.file_format = "OPEN_EXR_MULTILAYER" if with_albedo else "OPEN_EXR"
+        scene.render.image_settings.color_mode = "RGB"
         camera.place(scene.camera, *self.extrinsics(view))
-        scene.cycles.use_light_tree = lights.uses_tree(self.spec)
         scene.cycles.seed = (self.spec.drop * len(self.spec.views) + view) % 2**31
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "image.exr"
             scene.render.filepath = str(file)
             with blender.console_to(self.session.log):
                 self.session.bpy.ops.render.render(write_still=True)
-            light = read_exr(file)
-        if self.session.pinhole is self.session.intrinsics:
-            return light
-        return warped(light, self.session.intrinsics)
+            return _read_passes(file, "Combined", "Denoising Albedo") if with_albedo else read_exr(file)
+
+
+def _read_passes(file: Path, *passes: str) -> NDArray[np.float32]:
+    """(H, W, 3 n) float32 colours of n passes of an OpenEXR file of many layers."""
+    import OpenEXR
+
+    with OpenEXR.File(str(file), separate_channels=True) as content:
+        channels = {name.partition(".")[2]: channel.pixels for name, channel in content.channels().items()}
+        return np.stack([channels[f"{name}.{colour}"] for name in passes for colour in "RGB"], axis=-1)
 
 
 def read_exr(file: Path) -> NDArray[np.float32]:
@@ -204,7 +250,7 @@ def _configure(scene: Any, settings: RenderSettings) -> None:
     cycles.diffuse_bounces = cycles.glossy_bounces = settings.bounces
     cycles.transmission_bounces = cycles.volume_bounces = cycles.transparent_max_bounces = 0
     cycles.caustics_reflective = cycles.caustics_refractive = False  # they are what fireflies are made of
-    cycles.use_denoising = settings.denoiser != "none"
+    cycles.use_denoising = settings.denoiser in ("fast", "accurate")
     cycles.denoiser = "OPENIMAGEDENOISE"
     cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
     cycles.denoising_use_gpu = cycles.device == "GPU"

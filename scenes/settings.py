@@ -313,8 +313,8 @@ class TableSettings(Settings):
 
 
 QUALITIES: dict[str, dict[str, Any]] = {
-    "draft": {"samples": 4, "denoiser": "fast"},
-    "standard": {"samples": 12, "denoiser": "fast"},
+    "draft": {"samples": 2, "denoiser": "guided"},
+    "standard": {"samples": 6, "denoiser": "guided"},
     "reference": {"samples": 256, "denoiser": "accurate"},
 }
 """What the named qualities stand for; how near each comes to a converged render is in docs/scaling.md."""
@@ -327,9 +327,9 @@ class RenderSettings(Settings):
     """Sets samples and denoiser: draft to try a recipe out, standard to train with, reference to compare with."""
     samples: Annotated[int, Bounds(1, 65536, "samples")] = QUALITIES["standard"]["samples"]
     """Light paths per pixel; if not given, those of the quality."""
-    denoiser: Literal["none", "fast", "accurate"] = QUALITIES["standard"]["denoiser"]
-    """Open Image Denoise with albedo and normal guides: none, fast (guides as they are), accurate (guides denoised
-    first); if not given, the quality's."""
+    denoiser: Literal["none", "guided", "fast", "accurate"] = QUALITIES["standard"]["denoiser"]
+    """Open Image Denoise with albedo and normal guides: none; guided, by guides without noise, from the geometry; or as
+    Blender calls it, fast (guides as sampled) or accurate (guides denoised first); if not given, the quality's."""
     bounces: Annotated[int, Bounds(0, 128, "bounces")] = 3
     """Reflections of light between surfaces."""
     exposure: Annotated[FloatRange, Bounds(0.01, 0.99)] = (0.15, 0.7)

@@ -47,3 +47,28 @@ def cycles_geometry(scene: BlenderScene, view: int, folder: Path) -> CyclesGeome
         index = next(c.pixels for name, c in channels.items() if name.endswith("IndexOB.X"))
         depth, index = np.array(depth, dtype=np.float64), np.array(index)
     return CyclesGeometry(np.where(depth < 1e6, depth * 1000, 0.0), np.rint(index).astype(np.int64))
+
+
+def cycles_guides(scene: BlenderScene, view: int, folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Render as the session is set up, and read albedo and normals, OpenCV camera frame, (H, W, 3) each."""
+    import OpenEXR
+
+    bpy_scene = scene.session.bpy.context.scene
+    layer, render, file = bpy_scene.view_layers[0], bpy_scene.render, folder / "guides.exr"
+    try:
+        layer.cycles.denoising_store_passes = True
+        render.image_settings.file_format = "OPEN_EXR_MULTILAYER"
+        render.filepath = str(file)
+        camera.place(bpy_scene.camera, *scene.extrinsics(view))
+        scene.session.bpy.ops.render.render(write_still=True)
+    finally:
+        layer.cycles.denoising_store_passes = False
+        render.image_settings.file_format = "OPEN_EXR"
+        render.image_settings.color_mode = "RGB"
+    with OpenEXR.File(str(file), separate_channels=True) as content:
+        pixels = {name: np.array(c.pixels, dtype=np.float64) for name, c in content.channels().items()}
+
+    def read(name: str, axes: str) -> NDArray[np.float64]:
+        return np.stack([next(p for n, p in pixels.items() if n.endswith(f"{name}.{axis}")) for axis in axes], axis=-1)
+
+    return read("Denoising Albedo", "RGB"), read("Denoising Normal", "XYZ") * [1, -1, 1]  # Cycles' camera has y up

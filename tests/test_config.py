@@ -182,9 +182,9 @@ def test_a_folder_of_distractors_alone_asks_for_some() -> None:
 def test_a_quality_sets_what_is_not_given() -> None:
     draft, standard = load_recipe(None, ["render.quality=draft"]).render, load_recipe(None).render
     assert draft.samples < standard.samples < load_recipe(None, ["render.quality=reference"]).render.samples
-    assert draft.denoiser == "fast"
+    assert draft.denoiser == "guided"
     mixed = load_recipe(None, ["render.quality=draft", "render.samples=77"]).render
-    assert (mixed.samples, mixed.denoiser) == (77, "fast")
+    assert (mixed.samples, mixed.denoiser) == (77, "guided")
 
 
 @pytest.mark.parametrize("quality", ["draft", "standard", "reference"])

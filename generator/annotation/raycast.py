@@ -395,6 +395,17 @@ class Plane:
                     return z
             return np.where(self._is_met(rays.x, rays.y, z), z, np.inf)
 
+    def depth_along(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(...) z where rays (..., 3), up to z = 1, meet the table, inf where they do not."""
+        world = rays @ self.R_w2c
+        origin = self.t_w2c @ self.R_w2c
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z: NDArray[np.float64] = origin[2] / world[..., 2]
+            met = np.isfinite(z) & (z >= NEAR_CLIP_MM)
+            if self.half_size_mm is not None:
+                met &= (np.abs(world[..., :2] * z[..., None] - origin[:2]) <= self.half_size_mm).all(axis=-1)
+        return np.where(met, z, np.inf)
+
     def _is_met(
         self, x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64], margin_mm: float = 0.0
     ) -> NDArray[np.bool_]:
@@ -486,6 +497,58 @@ class RayCaster:
         coordinates_mm = np.zeros((*met.shape, 3))
         coordinates_mm[rows, columns] = hits.body.to_model(points_mm)
         return hits.rays.window, met, coordinates_mm
+
+    def surfaces(
+        self, camera: Intrinsics, plane: Plane, bodies: Sequence[PosedModel | PosedSurface]
+    ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+        """What is seen at the pixels' centres; errors as in ``annotate``.
+
+        Returns:
+            (H, W) the number of the nearest body, their count for the plane, -1 for nothing; and (H, W, 3) its normals
+            as in ``annotate``.
+        """
+        image = image_window(camera)
+        scene = _NearestSurface(camera, [self._cast(camera, posed, image) for posed in bodies], plane)
+        return scene.owner, scene.normals()
+
+    def surfaces_between(
+        self,
+        camera: Intrinsics,
+        plane: Plane,
+        bodies: Sequence[PosedModel | PosedSurface],
+        pixels: NDArray[np.intp],
+        offsets_px: NDArray[np.float64],
+    ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+        """What is seen around the centres of some pixels; errors as in ``annotate``.
+
+        Args:
+            camera, plane, bodies: as for ``surfaces``.
+            pixels: (N, 2) column and row.
+            offsets_px: (K, 2) where the rays of each of them meet it, from its centre.
+
+        Returns:
+            (N, K) and (N, K, 3), as ``surfaces`` gives them for all pixels.
+        """
+        shape = len(pixels), len(offsets_px)
+        at = pixels[:, None] + offsets_px
+        rays = np.ones((*shape, 3))
+        rays[..., 0], rays[..., 1] = (at[..., 0] - camera.cx) / camera.fx, (at[..., 1] - camera.cy) / camera.fy
+        nearest = plane.depth_along(rays)
+        owner = np.where(np.isfinite(nearest), np.int32(len(bodies)), np.int32(-1))
+        normals = np.where((owner >= 0)[..., None], plane.normal, 0.0).astype(np.float32)
+        for number, posed in enumerate(bodies):
+            body = self.pose(posed)
+            window = body.window(camera)
+            inside = (pixels >= (window.left - 2, window.top - 2)) & (pixels < (window.right + 2, window.bottom + 2))
+            chosen = np.flatnonzero(inside.all(axis=1))
+            towards = rays[chosen].reshape(-1, 3)
+            faces, depth_mm = body.first_hits(towards)
+            hit = np.flatnonzero(depth_mm < nearest[chosen].ravel())
+            place = chosen[hit // shape[1]], hit % shape[1]
+            facing = body.normals(faces[hit])
+            facing *= -np.copysign(1.0, _dot(facing, towards[hit]))[:, None]
+            nearest[place], owner[place], normals[place] = depth_mm[hit], number, facing
+        return owner, normals
 
     def pose(self, posed: PosedModel | PosedSurface) -> PosedSurface:
         """A mesh in front of the camera; errors as in ``annotate``."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from synthetless.annotation.guides import make_guides
 from synthetless.annotation.instances import ImageAnnotation, MeshKey, PosedModel
 from synthetless.annotation.raycast import Plane, PosedSurface, RayCaster
 from synthetless.config import Recipe
@@ -15,7 +16,10 @@ from synthetless.io.images import has_depth
 from synthetless.io.models import ObjectModel
 from synthetless.scenes.camera import extrinsics, settled_centre
 from synthetless.scenes.container import container_mesh
+from synthetless.scenes.denoise import Guides
 from synthetless.scenes.depth_sensor import Returns, sense
+from synthetless.scenes.lens import pinhole_around
+from synthetless.scenes.materials import TableTexture
 from synthetless.scenes.rotations import matrix
 from synthetless.scenes.spec import DepthSensorSpec, Pose, Role, SceneSpec
 from synthetless.scenes.srgb import LUMINANCE_WEIGHTS
@@ -75,19 +79,14 @@ def annotate_scene(
     Raises:
         ValueError: a mesh is not among the caster's.
     """
-    R_w2c, t_w2c_m = extrinsics(scene.views[view], settled_centre(settled))
-    t_w2c = t_w2c_m * MM_PER_M
-    posed = [
-        PosedModel(item.obj_id, *model_to_camera(pose, R_w2c, t_w2c), item.role)
-        for item, pose in zip(scene.objects, settled, strict=True)
-    ]
+    plane, posed = _in_view(recipe, scene, settled, view)
     labelled = [number for number, model in enumerate(posed) if model.role == "model"]
     distractors = [model for model in posed if model.role != "model"]
     image = caster.annotate(
         recipe.intrinsics,
-        Plane(R_w2c, t_w2c, recipe.table.size_m * MM_PER_M / 2),
+        plane,
         [posed[number] for number in labelled],
-        [*distractors, *container_surfaces(caster, scene, R_w2c, t_w2c)],
+        [*distractors, *container_surfaces(caster, scene, plane.R_w2c, plane.t_w2c)],
         recipe.labels.visibility_delta_mm,
         "normals" in recipe.outputs,
         "object_coordinates" in recipe.outputs,
@@ -102,7 +101,8 @@ def annotate_scene(
         image = image.where_valid(has_depth(image.depth_mm, recipe.encoding.depth_scale))
     inside = [n for n, instance in enumerate(image.instances) if instance.mask.any()]
     numbers = tuple(labelled[n] for n in inside)
-    return AnnotatedScene(R_w2c, t_w2c, tuple(posed[n] for n in numbers), numbers, image.restricted(inside), sensed_mm)
+    shown = tuple(posed[n] for n in numbers)
+    return AnnotatedScene(plane.R_w2c, plane.t_w2c, shown, numbers, image.restricted(inside), sensed_mm)
 
 
 def _albedo(scene: SceneSpec) -> NDArray[np.float32]:
@@ -111,6 +111,34 @@ def _albedo(scene: SceneSpec) -> NDArray[np.float32]:
     materials = [*of_roles[0], *of_roles[1], *([] if scene.container is None else [scene.container.material])]
     scattered = [float(np.dot(made_of.albedo, LUMINANCE_WEIGHTS)) * (1 - made_of.metallic) for made_of in materials]
     return np.array([*scattered, _TABLE_ALBEDO, 0.0], dtype=np.float32)
+
+
+def scene_guides(
+    caster: RayCaster, recipe: Recipe, scene: SceneSpec, settled: Sequence[Pose], view: int, texture: TableTexture
+) -> Guides:
+    """What a denoiser may know of one view of a scene before it is rendered.
+
+    Args:
+        caster, recipe, scene, settled, view: as for ``annotate_scene``.
+        texture: what covers the table.
+    """
+    plane, posed = _in_view(recipe, scene, settled, view)
+    known = [item.material.albedo if item.material.colour == "grey" else None for item in scene.objects]
+    held = container_surfaces(caster, scene, plane.R_w2c, plane.t_w2c)
+    if scene.container is not None:
+        known.append(scene.container.material.albedo)
+    return make_guides(caster, pinhole_around(recipe.intrinsics), plane, [*posed, *held], known, texture)
+
+
+def _in_view(recipe: Recipe, scene: SceneSpec, settled: Sequence[Pose], view: int) -> tuple[Plane, list[PosedModel]]:
+    """The table and every object in front of a camera."""
+    R_w2c, t_w2c_m = extrinsics(scene.views[view], settled_centre(settled))
+    t_w2c = t_w2c_m * MM_PER_M
+    posed = [
+        PosedModel(item.obj_id, *model_to_camera(pose, R_w2c, t_w2c), item.role)
+        for item, pose in zip(scene.objects, settled, strict=True)
+    ]
+    return Plane(R_w2c, t_w2c, recipe.table.size_m * MM_PER_M / 2), posed
 
 
 def container_surfaces(

@@ -52,6 +52,10 @@ _MAY_CHANGE = ("images", "name", "source")
 """Settings that a dataset may be continued under another value of: the sources are compared by their content."""
 
 
+_TOLD = 3
+"""Settings that a refusal tells of; all that a quality sets are among them, if nothing else differs."""
+
+
 class DatasetError(UserError):
     """A folder that cannot take the dataset; the message is one line."""
 
@@ -401,11 +405,15 @@ def _refuse_other(path: Path, before: Mapping[str, Any], now: Mapping[str, Any])
         if before.get(key) != now.get(key):
             raise DatasetError(f"{path}: was begun with other {key} than now; use another output folder")
     old, new = _flat(before["recipe"]), _flat(now["recipe"])
-    for key in sorted(old.keys() | new.keys()):
-        if key.split(".", maxsplit=1)[0] not in _MAY_CHANGE and old.get(key) != new.get(key):
-            raise DatasetError(
-                f"{path}: was begun with {key} = {old.get(key)}, now it is {new.get(key)}; use another output folder"
-            )
+    changed = [
+        key
+        for key in sorted(old.keys() | new.keys())
+        if key.split(".", maxsplit=1)[0] not in _MAY_CHANGE and old.get(key) != new.get(key)
+    ]
+    if changed:
+        told = ", ".join(f"{key} = {old.get(key)}, now it is {new.get(key)}" for key in changed[:_TOLD])
+        more = f" (and {len(changed) - _TOLD} more)" if len(changed) > _TOLD else ""
+        raise DatasetError(f"{path}: was begun with {told}{more}; use another output folder, or what it was begun with")
 
 
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

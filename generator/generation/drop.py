@@ -7,9 +7,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
-from synthetless.annotation.scene import annotate_scene, scene_caster
+import numpy as np
+from numpy.typing import NDArray
+
+from synthetless.annotation.scene import annotate_scene, scene_caster, scene_guides
 from synthetless.config import Recipe
 from synthetless.dataset.layout import ImagePlan
 from synthetless.dataset.store import FinishedImage, planned_depth_sensor
@@ -118,6 +122,11 @@ class DropRenderer:
                 reason = str(failure)
         raise DropFailed(f"did not come to rest in {throws} throws; the last time, {reason}")
 
+    def render(self, scene: BlenderScene, settled: Sequence[Pose], view: int) -> NDArray[np.float32]:
+        """Linear image (H, W, 3) of one view of a scene, objects at rest; errors as in ``BlenderScene.render``."""
+        guides = partial(scene_guides, self._caster, self._recipe, scene.spec, settled, view, scene.texture)
+        return scene.render(view, guides)
+
     def _colliders_of(self, spec: SceneSpec, report: Report) -> list[Collider]:
         keys: list[ModelKey] = [(item.role, item.obj_id) for item in spec.objects]
         new = list(dict.fromkeys(key for key in keys if key not in self._colliders))
@@ -134,5 +143,5 @@ class DropRenderer:
     def _image(self, plan: ImagePlan, scene: BlenderScene, settled: Sequence[Pose]) -> FinishedImage:
         depth_sensor = planned_depth_sensor(self._recipe, plan)
         annotated = annotate_scene(self._caster, self._recipe, scene.spec, settled, plan.view, depth_sensor)
-        linear = scene.render(plan.view) if {"rgb", "exr"} & set(self._recipe.outputs) else None
+        linear = self.render(scene, settled, plan.view) if {"rgb", "exr"} & set(self._recipe.outputs) else None
         return FinishedImage.of(self._recipe, plan, scene.spec, settled, annotated, linear)

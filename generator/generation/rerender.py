@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from synthetless.annotation.scene import MM_PER_M, scene_caster, scene_guides
 from synthetless.config import BUILTIN, Recipe, models_folder
 from synthetless.dataset.layout import MODELS_FOLDER, ScenePaths
 from synthetless.dataset.reader import read_recipe, read_specs
@@ -43,23 +45,29 @@ def render_again(dataset: Path, scene_id: int, im_id: int, textures: Path | None
     if textures is None and recipe.source.textures != BUILTIN:
         textures = Path(recipe.source.textures)
     panoramas = None if recipe.light.environments is None else Path(recipe.light.environments)
-    meshes = _meshes(dataset, recipe, image.scene)
+    models = _models(dataset, recipe, image.scene)
+    meshes = {
+        (role, i): Mesh(model.vertices_mm / MM_PER_M, model.faces, colours=model.colours)
+        for role, of in models.items()
+        for i, model in of.items()
+    }
     session = BlenderSession(meshes, recipe.intrinsics, recipe.render, recipe.table, textures, panoramas=panoramas)
     with session.scene(image.scene, image.settled) as scene:
-        return picture(scene.render(image.view), image.exposure_gain, image.sensor, recipe.render.shoulder)
+        guides = partial(
+            scene_guides, scene_caster(models), recipe, image.scene, image.settled, image.view, scene.texture
+        )
+        linear = scene.render(image.view, guides)
+        return picture(linear, image.exposure_gain, image.sensor, recipe.render.shoulder)
 
 
-def _meshes(dataset: Path, recipe: Recipe, scene: SceneSpec) -> Mapping[tuple[Role, int], Mesh]:
+def _models(dataset: Path, recipe: Recipe, scene: SceneSpec) -> Mapping[Role, Mapping[int, ObjectModel]]:
+    """Those that the scene shows, by role and object id."""
     folders: dict[Role, Path] = {"model": dataset / MODELS_FOLDER}
     if recipe.source.distractors is not None:
         folders["distractor"] = models_folder(recipe.source.distractors)
-    meshes: dict[tuple[Role, int], Mesh] = {}
+    models: dict[Role, Mapping[int, ObjectModel]] = {}
     for role, folder in folders.items():
         ids = tuple({item.obj_id for item in scene.objects if item.role == role})
         colours = any(item.role == role and item.material.colour == "model" for item in scene.objects)
-        models: Mapping[int, ObjectModel] = load_models(folder, ids, colours) if ids else {}
-        meshes |= {
-            (role, obj_id): Mesh(model.vertices_mm / 1000, model.faces, colours=model.colours)
-            for obj_id, model in models.items()
-        }
-    return meshes
+        models[role] = load_models(folder, ids, colours) if ids else {}
+    return models

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import threading
 import time
@@ -13,6 +14,7 @@ from trees import contents
 
 from synthetless.config import Recipe, load_recipe
 from synthetless.dataset.layout import DATASET_FILE, Part
+from synthetless.dataset.reader import read_recipe
 from synthetless.generation import estimate as estimation
 from synthetless.generation import executors
 from synthetless.generation import generate as generation
@@ -147,3 +149,19 @@ def test_workers_that_hang_while_starting_end_the_run(
     with pytest.raises(BlenderError, match=told):
         list(executors.run([DropTask(0, ())], config, 2))
     assert not multiprocessing.active_children()
+
+
+def test_a_dataset_is_continued_at_the_quality_it_was_made_with_or_not_at_all(recipe: Recipe, begun: Path) -> None:
+    """What a quality stands for has changed; it is recorded, and so neither forgotten nor mixed up."""
+    file = begun / DATASET_FILE
+    header = json.loads(file.read_text())
+    assert header["recipe"]["render"]["denoiser"] == recipe.render.denoiser
+    header["recipe"]["render"] |= {"samples": 12, "denoiser": "fast"}  # as `standard` was
+    file.write_text(json.dumps(header))
+    before = contents(begun)
+    with pytest.raises(ValueError, match=r"begun with render\.denoiser = fast, now it is guided, render\.samples = 12"):
+        generate(recipe, begun, Execution(workers=1))
+    assert contents(begun) == before
+    as_before = recipe.render.model_copy(update={"samples": 12, "denoiser": "fast"})
+    generate(recipe.model_copy(update={"render": as_before}), begun, Execution(workers=1))
+    assert read_recipe(begun).render == as_before

@@ -1,0 +1,136 @@
+"""Removes the noise of few samples, by guides that have none.
+
+Cycles' own denoiser is guided by what it has sampled, which is as noisy as the image along edges and in fine texture.
+Open Image Denoise takes guides that are known to be clean, too, and keeps every edge that they show. It is called here
+through its C interface (https://www.openimagedenoise.org/documentation.html), in the library that bpy comes with.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synthetless.scenes import blender
+
+Image = NDArray[np.float32]
+
+_LIBRARIES = (
+    "libOpenImageDenoise.so*",
+    "libOpenImageDenoise.[0-9]*dylib",
+    "libOpenImageDenoise.dylib",
+    "*imagedenoise.dll",
+)
+_CPU, _FLOAT3, _HIGH = 1, 3, 6  # OIDN_DEVICE_TYPE_CPU, OIDN_FORMAT_FLOAT3, OIDN_QUALITY_HIGH
+
+
+@dataclass(frozen=True, eq=False)
+class Guides:
+    """What the surface in each pixel is like, without noise: means over the pixel's area.
+
+    Attributes:
+        albedo: (H, W, 3) linear; 0 where there is no surface.
+        normals: (H, W, 3) unit normals, averaged; 0 where there is no surface.
+        known: (H, W) where the albedo is that of all that is seen.
+    """
+
+    albedo: Image
+    normals: Image
+    known: NDArray[np.bool_]
+
+    def completed(self, sampled: Image) -> Guides:
+        """With the albedo as it was sampled, (H, W, 3), where it is not known."""
+        return replace(self, albedo=np.where(self.known[..., None], self.albedo, sampled))
+
+
+class Denoiser:
+    """Open Image Denoise on the processor. The same images give the same bytes."""
+
+    def __init__(self, threads: int = 1) -> None:
+        """Load the library and start its threads; 0 takes every core.
+
+        Raises:
+            BlenderError: it cannot be loaded.
+        """
+        self._library = _load()
+        call = self._library
+        self._device = call.oidnNewDevice(_CPU)
+        call.oidnSetDeviceInt(self._device, b"numThreads", threads)
+        call.oidnSetDeviceBool(self._device, b"setAffinity", False)
+        call.oidnCommitDevice(self._device)
+        self._filter = call.oidnNewFilter(self._device, b"RT")  # kept: its weights are put in order only once
+        self._refuse_error()
+
+    def denoise(self, linear: Image, guides: Guides) -> Image:
+        """(H, W, 3) of a noisy (H, W, 3) image of linear light.
+
+        Raises:
+            ValueError: the guides are not those of such an image.
+            BlenderError: the library fails.
+        """
+        call, result = self._library, np.empty_like(linear)
+        images = {
+            "color": np.ascontiguousarray(linear),
+            "albedo": np.ascontiguousarray(guides.albedo),
+            "normal": np.ascontiguousarray(guides.normals),
+            "output": result,
+        }
+        height, width = linear.shape[:2]
+        for name, image in images.items():
+            if image.dtype != np.float32 or image.shape != (height, width, 3):
+                raise ValueError(
+                    f"{name} of shape {image.shape} and type {image.dtype}; float32 like the image is needed"
+                )
+            call.oidnSetSharedFilterImage(
+                self._filter, name.encode(), image.ctypes.data, _FLOAT3, width, height, 0, 0, 0
+            )
+        call.oidnSetFilterBool(self._filter, b"hdr", True)
+        call.oidnSetFilterBool(self._filter, b"cleanAux", True)
+        call.oidnSetFilterInt(self._filter, b"quality", _HIGH)
+        call.oidnCommitFilter(self._filter)
+        call.oidnExecuteFilter(self._filter)
+        self._refuse_error()
+        return result
+
+    def _refuse_error(self) -> None:
+        message = ctypes.c_char_p()
+        if self._library.oidnGetDeviceError(self._device, ctypes.byref(message)):
+            raise blender.BlenderError(f"Open Image Denoise: {(message.value or b'unknown error').decode()}")
+
+
+def _load() -> Any:
+    """The library, with the types of what is called of it."""
+    folder = Path(blender.module().utils.resource_path("LOCAL")).parent
+    found = sorted(path for pattern in _LIBRARIES for path in folder.rglob(pattern))
+    if not found:
+        raise blender.BlenderError(
+            f"{folder}: has no Open Image Denoise; use Blender's own denoiser: --set render.denoiser=fast"
+        )
+    try:
+        library = ctypes.CDLL(str(found[0]))
+    except OSError as error:
+        raise blender.BlenderError(
+            f"{found[0]}: cannot be loaded ({error}); --set render.denoiser=fast does without"
+        ) from None
+    handle, name, size = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_size_t
+    signatures: dict[str, tuple[Any, list[Any]]] = {
+        "oidnNewDevice": (handle, [ctypes.c_int]),
+        "oidnSetDeviceInt": (None, [handle, name, ctypes.c_int]),
+        "oidnSetDeviceBool": (None, [handle, name, ctypes.c_bool]),
+        "oidnCommitDevice": (None, [handle]),
+        "oidnGetDeviceError": (ctypes.c_int, [handle, ctypes.POINTER(ctypes.c_char_p)]),
+        "oidnNewFilter": (handle, [handle, name]),
+        "oidnSetSharedFilterImage": (None, [handle, name, handle, ctypes.c_int, size, size, size, size, size]),
+        "oidnSetFilterBool": (None, [handle, name, ctypes.c_bool]),
+        "oidnSetFilterInt": (None, [handle, name, ctypes.c_int]),
+        "oidnCommitFilter": (None, [handle]),
+        "oidnExecuteFilter": (None, [handle]),
+    }
+    for function, (result, arguments) in signatures.items():
+        getattr(library, function).restype = result
+        getattr(library, function).argtypes = arguments
+    return library

@@ -1,0 +1,133 @@
+"""The guided denoiser, in the library that comes with Blender; and its guides against what Cycles samples."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from synthetless.annotation.scene import scene_caster, scene_guides
+from synthetless.config import BUILTIN_MODELS, Recipe, load_recipe
+from synthetless.io.models import load_models
+from synthetless.scenes import denoise
+from synthetless.scenes.blender import BlenderError
+from synthetless.scenes.denoise import Denoiser, Guides
+from synthetless.scenes.render import BlenderScene, BlenderSession
+from synthetless.scenes.sampling import Catalogue, sample_scene
+from synthetless.scenes.settings import RenderSettings
+from synthetless.scenes.spec import Mesh, Pose
+from tests.agreement import cycles_guides
+
+pytestmark = pytest.mark.blender
+
+CONVERGED = RenderSettings(samples=64, denoiser="none")
+
+
+def _recipe() -> Recipe:
+    camera = "camera={width: 96, height: 72, fx: 160, fy: 150, cx: 50, cy: 33}"
+    return load_recipe(
+        None, [camera, "objects={count: [4, 4], specular: [0, 0]}", "table.tile_m=[0.2, 0.2]", "render.samples=4"]
+    )
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[BlenderScene, partial[Guides]]]:
+    """A scene of built-in parts that hover over the table, and what gives its guides."""
+    recipe, models = _recipe(), load_models(BUILTIN_MODELS)
+    session = BlenderSession(
+        {("model", key): Mesh(model.vertices_mm / 1000, model.faces) for key, model in models.items()},
+        recipe.intrinsics,
+        recipe.render,
+        recipe.table,
+        threads=1,
+        log=tmp_path_factory.mktemp("session") / "log",
+    )
+    sizes = {key: model.diameter_mm / 1000 for key, model in models.items()}
+    spec = sample_scene(recipe, Catalogue(sizes, {}, ()), seed=4, drop=0)
+    settled = [Pose(item.release.rotation_wxyz, (0.05 * k - 0.07, 0.0, 0.04)) for k, item in enumerate(spec.objects)]
+    with session.scene(spec, settled) as scene:
+        yield (
+            scene,
+            partial(scene_guides, scene_caster({"model": models}), recipe, spec, settled, 0, scene.texture),
+        )
+
+
+def test_guides_are_what_cycles_samples(built: tuple[BlenderScene, partial[Guides]], tmp_path: Path) -> None:
+    """A flip, a shift or a wrong mirroring of the texture would show, as would a body that is not where it is."""
+    scene, guides = built
+    scene.session.configure(CONVERGED)
+    albedo, normals = cycles_guides(scene, 0, tmp_path)
+    found = guides()
+    assert np.abs(found.albedo - albedo).mean() < 0.01
+    assert np.corrcoef(found.albedo.ravel(), albedo.ravel())[0, 1] > 0.99
+    assert (np.einsum("ijk,ijk->ij", found.normals, normals) > 0.8).mean() > 0.95
+
+
+def test_it_takes_the_noise_and_leaves_the_edges(built: tuple[BlenderScene, partial[Guides]]) -> None:
+    scene, guides = built
+    scene.session.configure(CONVERGED)
+    exact = scene.render(0)
+    scene.session.configure(RenderSettings(samples=4, denoiser="none"))
+    noisy = scene.render(0)
+    scene.session.configure(RenderSettings(samples=4, denoiser="guided"))
+    clean = scene.render(0, guides)
+    assert _error(clean, exact) < 0.5 * _error(noisy, exact)
+    nothing_known = replace(guides(), known=np.zeros(clean.shape[:2], dtype=bool))
+    assert _error(clean, exact) < _error(scene.render(0, lambda: nothing_known), exact) < _error(noisy, exact)
+    np.testing.assert_array_equal(scene.render(0, guides), clean)  # the other way to read the image left no trace
+    assert _error(clean, exact) < 0.8 * _error(_with_blenders_own(scene), exact)
+    scene.session.configure(RenderSettings(samples=4, denoiser="guided"))
+    with pytest.raises(ValueError, match="needs guides"):
+        scene.render(0)
+
+
+def test_the_same_bytes_with_any_threads_and_after_another_image(built: tuple[BlenderScene, partial[Guides]]) -> None:
+    scene, guides = built
+    scene.session.configure(RenderSettings(samples=2, denoiser="guided"))
+    first, known = scene.render(0, guides), guides()
+    scene.session.denoiser.denoise(np.ones((40, 30, 3), dtype=np.float32), _blank((40, 30, 3)))
+    np.testing.assert_array_equal(scene.render(0, guides), first)
+    np.testing.assert_array_equal(guides().albedo, known.albedo)
+    for threads in (1, 2):
+        np.testing.assert_array_equal(
+            Denoiser(threads).denoise(exact := first * 0.5, known), Denoiser(1).denoise(exact, known)
+        )
+
+
+def test_images_that_do_not_fit_are_refused() -> None:
+    image = np.ones((8, 9, 3), dtype=np.float32)
+    for guides in (_blank((9, 8, 3)), Guides(image.astype(np.float64), image, image[..., 0] > 0)):  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match="float32 like the image is needed"):
+            Denoiser().denoise(image, guides)
+
+
+def test_a_blender_without_the_library_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(denoise, "_LIBRARIES", ("nothing*",))
+    with pytest.raises(BlenderError, match=r"no Open Image Denoise; .*--set render\.denoiser=fast"):
+        Denoiser()
+    damaged = tmp_path / "libOpenImageDenoise.so.2"
+    damaged.write_bytes(b"damaged")
+    monkeypatch.setattr(denoise, "_LIBRARIES", (damaged.name,))
+    utils = SimpleNamespace(resource_path=lambda kind: str(tmp_path / "4.5"))
+    monkeypatch.setattr(denoise.blender, "module", lambda: SimpleNamespace(utils=utils))
+    with pytest.raises(BlenderError, match=r"cannot be loaded .*render\.denoiser=fast"):
+        Denoiser()
+
+
+def _blank(shape: tuple[int, int, int]) -> Guides:
+    return Guides(*(np.zeros(shape, dtype=np.float32) for _ in range(2)), np.ones(shape[:2], dtype=bool))
+
+
+def _with_blenders_own(scene: BlenderScene) -> NDArray[np.float32]:
+    scene.session.configure(RenderSettings(samples=4, denoiser="fast"))
+    return scene.render(0)
+
+
+def _error(image: NDArray[np.float32], exact: NDArray[np.float32]) -> float:
+    return float(np.sqrt(np.mean((image - exact) ** 2)))
