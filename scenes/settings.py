@@ -314,7 +314,7 @@ class TableSettings(Settings):
 
 QUALITIES: dict[str, dict[str, Any]] = {
     "draft": {"samples": 2, "denoiser": "guided"},
-    "standard": {"samples": 6, "denoiser": "guided"},
+    "standard": {"samples": 7, "denoiser": "guided"},
     "reference": {"samples": 256, "denoiser": "accurate"},
 }
 """What the named qualities stand for; how near each comes to a converged render is in docs/scaling.md."""
