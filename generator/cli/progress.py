@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -24,11 +25,21 @@ def display(as_json: bool) -> Iterator[Callable[[Progress], None]]:
     """Show progress on stderr for the duration, as suits what stderr is."""
     if as_json:
         yield _Lines(_as_json, _JSON_EVERY_S)
-    elif sys.stderr.isatty():
+    elif _is_terminal():
         with _bar() as tell:
             yield tell
     else:
         yield _Lines(str, _LINE_EVERY_S)
+
+
+def _is_terminal() -> bool:
+    """Whether stderr is a terminal of a known size; in one of no rows, as containers may have, tqdm draws nothing."""
+    if not sys.stderr.isatty():
+        return False
+    try:
+        return min(os.get_terminal_size(sys.stderr.fileno())) > 0
+    except OSError:
+        return True
 
 
 class _Lines:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import sys
 from collections.abc import Sequence
+from typing import TextIO
 
 import pytest
 from hypothesis import given
@@ -88,13 +90,13 @@ class _Terminal(io.StringIO):
         return True
 
 
-def _shown(as_json: bool, stderr: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> str:
+def _shown(as_json: bool, stderr: TextIO, monkeypatch: pytest.MonkeyPatch) -> str:
     monkeypatch.setattr(sys, "stderr", stderr)
     with display(as_json) as tell:
         for share in (0.25, 0.5):
             for doing in ("rendering 1 of 2", "rendering 2 of 2"):
                 tell(Progress("making images", doing, 5, 12, share, 1, 60.0, 300.0, 84.0))
-    return stderr.getvalue()
+    return stderr.getvalue() if isinstance(stderr, io.StringIO) else ""
 
 
 def test_a_log_gets_a_line_for_a_phase(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,6 +110,16 @@ def test_a_terminal_gets_a_bar_that_goes_away(monkeypatch: pytest.MonkeyPatch) -
     assert " 50%|" in told
     assert "rendering 2 of 2" in told
     assert "\n" not in told
+
+
+def test_a_terminal_without_a_size_gets_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A real one, as Docker gives it where its own has no size: a bar would not be drawn at all."""
+    reading, writing = os.openpty()
+    with os.fdopen(writing, "w") as terminal:
+        assert terminal.isatty()
+        _shown(False, terminal, monkeypatch)
+        assert b"rendering 1 of 2" in os.read(reading, 1000)
+    os.close(reading)
 
 
 def test_a_scheduler_gets_json(monkeypatch: pytest.MonkeyPatch) -> None:
