@@ -75,6 +75,7 @@ def line_chart(curves: Mapping[str, Curve], x: str, y: str, logarithmic: bool = 
     try:
         from matplotlib import rc_context
         from matplotlib.figure import Figure
+        from matplotlib.ticker import StrMethodFormatter
     except ImportError:
         raise MissingExtraError("matplotlib") from None
     with rc_context(_STYLE):
@@ -86,6 +87,8 @@ def line_chart(curves: Mapping[str, Curve], x: str, y: str, logarithmic: bool = 
         axes.set_ylabel(y)
         if logarithmic:
             axes.set_yscale("log")
+            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))  # the others write mathematical text
+            axes.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}"))
         else:
             axes.set_ylim(bottom=0)
         if len(curves) > 1:

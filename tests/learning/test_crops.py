@@ -26,6 +26,7 @@ from synthetless.learning import fit as fitting  # noqa: E402
 from synthetless.learning.compare import Comparison, CropSets, compare, rendered_crops, train_crops  # noqa: E402
 from synthetless.learning.crops import CropBatcher, CropNet, _turn  # noqa: E402
 from synthetless.learning.heads import PoseHead, coset_loss, existing, pose_losses  # noqa: E402
+from synthetless.learning.pages import line_chart  # noqa: E402
 from synthetless.learning.solve import solve_pose  # noqa: E402
 from synthetless.learning.stream import CropSettings, CropStream, upright  # noqa: E402
 from synthetless.learning.targets import LABEL_SETS, LabelMaker, LabelSet, rolled, turned  # noqa: E402
@@ -175,6 +176,12 @@ def test_mapped_labels_are_learned_and_true_poses_are_not(models: Any) -> None:
         l1[labels], spread[labels] = row.l1, row.spread
     assert l1["map"] < 0.7 * l1["true"]
     assert spread["true"] < 0.6 < spread["map"]
+
+
+def test_a_logarithmic_axis_has_numbers() -> None:
+    drawn = line_chart({"a": ([1, 2], [0.03, 0.3])}, "x", "y", logarithmic=True)
+    assert b">0.1<" in drawn and b">0.2<" in drawn
+    assert b"mathdefault" not in drawn
 
 
 def test_a_small_comparison_writes_its_page(builtin_models: Path, tmp_path: Path) -> None:
