@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synthetless import doctor
+from synthetless import doctor, extras
 from synthetless.doctor import Check, Status, examine, is_fit, to_json, to_text
 from synthetless.generation.devices import Answer, ask
 from synthetless.io.files import nearest_existing
@@ -157,12 +157,17 @@ def test_python(version: tuple[int, ...], status: Status) -> None:
 
 
 @pytest.mark.parametrize(
-    ("version", "status"), [("4.5.15", "ok"), ("5.0.1", "warn"), ("4.50.0", "warn"), (None, "fail")]
+    ("version", "status", "remedy"),
+    [
+        ("4.5.15", "ok", ""),
+        ("5.0.1", "warn", "pip install 'bpy==4.5.*'"),
+        ("4.50.0", "warn", "pip install 'bpy==4.5.*'"),
+        (None, "fail", extras.remedy("blender")),
+    ],
 )
-def test_blender_version(version: str | None, status: Status) -> None:
+def test_blender_version(version: str | None, status: Status, remedy: str) -> None:
     check = doctor.check_blender(version)
-    assert check.status == status
-    assert check.remedy == ("" if status == "ok" else "pip install 'bpy==4.5.*'")
+    assert (check.status, check.remedy) == (status, remedy)
 
 
 def test_devices_are_listed() -> None:
