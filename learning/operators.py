@@ -54,7 +54,7 @@ def nms_by_class(boxes: Tensor, scores: Tensor, classes: Tensor, threshold: floa
 
 
 def roi_align(features: Tensor, boxes: Tensor, images: Tensor, size: int, stride: int, samples: int = 2) -> Tensor:
-    """(N, C, size, size) float32 features in a regular grid over each box (He et al., Mask R-CNN, 2017).
+    """(N, C, size, size) features in a regular grid over each box (He et al., Mask R-CNN, 2017), typed as the boxes.
 
     Args:
         features: (B, C, H, W); the centre of cell (column i, row j) is at pixel (stride (i + 1/2) - 1/2, ...).
@@ -71,7 +71,7 @@ def roi_align(features: Tensor, boxes: Tensor, images: Tensor, size: int, stride
     # grid_sample without aligned corners: -1 and 1 are the outer edges of the first and last cell.
     u, v = ((2 * (axis + 0.5) / (stride * cells) - 1) for axis, cells in ((x, width), (y, height)))
     grid = torch.stack([u[:, None, :].expand(-1, n, -1), v[:, :, None].expand(-1, -1, n)], dim=3)
-    features = features.float()  # which grid_sample wants of both its arguments, under autocast, too
+    features = features.to(boxes.dtype)  # grid_sample wants one type; under autocast boxes are float32, features not
     pooled = features.new_zeros(len(boxes), channels, size, size)
     for image in sorted(set(images.tolist())):
         rows = images == image
