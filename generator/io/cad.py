@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +50,7 @@ def read_cad(data: bytes, suffix: str, tolerance_mm: float) -> tuple[NDArray[np.
     import cascadio
     import trimesh
 
-    kind = "step" if suffix.lower() in (".step", ".stp") else "iges"
+    kind: Literal["step", "iges"] = "step" if suffix.lower() in (".step", ".stp") else "iges"
     with _silenced():
         options: dict[str, Any] = {"tol_linear": tolerance_mm, "tol_angular": _ANGLE_RAD, "use_parallel": False}
         glb: bytes = cascadio.load(data, file_type=kind, **options)
