@@ -41,7 +41,15 @@ from synthetless.dataset.records import CocoFile, GtEntry, ImageRecord, ImageSpe
 from synthetless.errors import UserError
 from synthetless.io import images
 from synthetless.io.color import exposure_gain, picture
-from synthetless.io.files import atomic_write, in_turn, read_json, replace_file, write_json, write_json_lines
+from synthetless.io.files import (
+    atomic_write,
+    in_turn,
+    read_json,
+    remove_drafts,
+    replace_file,
+    write_json,
+    write_json_lines,
+)
 from synthetless.io.models import INFO_FILE, ObjectModel, object_names, read_models_info, texture_file
 from synthetless.scenes.sampling import sample_depth_sensor, sample_sensor
 from synthetless.scenes.spec import DepthSensorSpec, Pose, SceneSpec, SensorSpec
@@ -269,6 +277,8 @@ class DatasetStore:
     ) -> dict[int, list[GtEntry]]:
         """Write the JSON files of a scene folder, unless they tell of every record already; return scene_gt."""
         scene = self.scene(scene_id)
+        for folder in (scene.root, self._records(scene_id)):
+            remove_drafts(folder)  # of a run that could not
         paths = {im_id: self.record(scene_id, im_id) for im_id in self._record_ids(scene_id)}
         if scene.scene_camera.exists():
             listed = records.read_scene_json(scene.scene_camera).keys()

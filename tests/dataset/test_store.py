@@ -107,6 +107,20 @@ def test_an_interrupted_assembly_is_made_good(
     assert contents(tmp_path / "d") == complete
 
 
+def test_drafts_of_a_run_that_could_not_remove_them_are_removed(
+    tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel]
+) -> None:
+    dataset = DatasetStore.open(tmp_path / "d", recipe, models, "")
+    dataset.commit(_image(0))
+    dataset.assemble()
+    complete = contents(tmp_path / "d")
+    nobody = 2**22 + 1  # a larger number than any process has
+    left = dataset.scene(1).root / f".scene_gt_info.json.{socket.gethostname()}.{nobody}.part"
+    left.write_text("{")
+    DatasetStore(tmp_path / "d", recipe).assemble()
+    assert contents(tmp_path / "d") == complete
+
+
 def test_assembling_does_not_read_again_what_is_finished(
     tmp_path: Path, recipe: Recipe, models: dict[int, ObjectModel], monkeypatch: pytest.MonkeyPatch
 ) -> None:
