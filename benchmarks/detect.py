@@ -8,11 +8,10 @@ With --markdown (T-LESS only) it writes docs/symmetry_tless.md, what was found b
 from __future__ import annotations
 
 import argparse
-import resource
 import time
 from pathlib import Path
 
-from benchmarks import ROOT, default_models, keep
+from benchmarks import ROOT, cpu_s, default_models, keep
 from synthetless.io.files import atomic_write
 from synthetless.io.parallel import usable_cores
 from synthetless.symmetry.detection import Detected, DetectedFolder, DetectedObject, GroupFit, detect_folder
@@ -48,9 +47,9 @@ def main() -> None:
     parser.add_argument("--markdown", action="store_true", help="write docs/symmetry_tless.md")
     arguments = parser.parse_args()
 
-    wall, cpu = time.perf_counter(), _cpu_s()
+    wall, cpu = time.perf_counter(), cpu_s()
     detected = detect_folder(arguments.models, workers=arguments.workers)
-    wall, cpu = time.perf_counter() - wall, _cpu_s() - cpu
+    wall, cpu = time.perf_counter() - wall, cpu_s() - cpu
     agreeing = [o.obj_id for o in detected.objects if _agrees(o.detected, o.detected.answer)]
     print(f"{len(detected.objects)} meshes, {arguments.workers} processes: {wall:.1f} s, CPU {cpu:.1f} s")
     print(f"as declared at {detected.tolerance_percent:g} %: {len(agreeing)}")
@@ -119,12 +118,6 @@ def _named(fit: GroupFit) -> str:
 
 def _percent(fit: GroupFit, found: Detected) -> str:
     return f"{100 * fit.residual.max_mm / found.diameter_mm:.2f}"
-
-
-def _cpu_s() -> float:
-    """CPU time of this process and of those it waited for."""
-    usages = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from synthetless.errors import UserError
 from synthetless.extras import cv2
 from synthetless.scenes.srgb import LUMINANCE_WEIGHTS
+from synthetless.scenes.textures.photos import files_below
 
 SUFFIXES = (".hdr", ".exr")
 _WIDEST_PX = 2048
@@ -30,11 +31,10 @@ def list_panoramas(folder: Path) -> tuple[str, ...]:
     """
     if not folder.is_dir():
         raise UserError(f"light.environments {folder}: not a folder; give one with .hdr or .exr panoramas")
-    found = (path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
-    names = sorted(path.as_posix() for path in found if not any(part.startswith(".") for part in path.parts))
+    names = files_below(folder, SUFFIXES)
     if not names:
         raise UserError(f"light.environments {folder}: no {' or '.join(SUFFIXES)} file in it or below")
-    return tuple(names)
+    return names
 
 
 def load_panorama(folder: Path, file: str) -> Light:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -26,11 +27,16 @@ def list_photos(folder: Path) -> tuple[str, ...]:
     """
     if not folder.is_dir():
         raise UserError(f"textures folder {folder}: not a folder; give one with .jpg or .png photographs")
-    found = (path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
-    names = sorted(p.as_posix() for p in found if not any(part.startswith(".") for part in p.parts))
+    names = files_below(folder, SUFFIXES)
     if not names:
         raise UserError(f"textures folder {folder}: no {', '.join(SUFFIXES)} file in it or below")
-    return tuple(names)
+    return names
+
+
+def files_below(folder: Path, suffixes: Collection[str]) -> tuple[str, ...]:
+    """Files with one of these suffixes, as sorted relative paths with forward slashes; hidden ones are left out."""
+    found = (path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in suffixes)
+    return tuple(sorted(path.as_posix() for path in found if not any(part.startswith(".") for part in path.parts)))
 
 
 def load_photo(folder: Path, file: str, max_size_px: int = 2048) -> NDArray[np.uint8]:

@@ -55,6 +55,20 @@ def _meshes() -> dict[int, tuple[NDArray[np.float64], NDArray[np.int32]]]:
     }
 
 
+def _session_and_caster(
+    camera: Intrinsics, meshes: Mapping[int, tuple[NDArray[np.float64], NDArray[np.int32]]], folder: Path
+) -> tuple[BlenderSession, RayCaster]:
+    """Blender's session and our rays, of the same meshes."""
+    session = BlenderSession(
+        {("model", key): Mesh(vertices / 1000, faces) for key, (vertices, faces) in meshes.items()},
+        camera,
+        RenderSettings(),
+        TableSettings(),
+        log=folder / "log",
+    )
+    return session, RayCaster({("model", key): mesh for key, mesh in meshes.items()})
+
+
 def _scene(recipe_overrides: list[str], diameters: Mapping[int, float], drop: int) -> tuple[SceneSpec, list[Pose]]:
     """A sampled scene whose objects hover in a grid: agreement needs no physics."""
     recipe = load_recipe(None, recipe_overrides)
@@ -115,14 +129,7 @@ def _eroded(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 @pytest.mark.parametrize("name", CAMERAS)
 def test_pixels_and_poses_agree_for_any_camera(name: str, tmp_path: Path) -> None:
     camera, meshes = CAMERAS[name], _meshes()
-    session = BlenderSession(
-        {("model", key): Mesh(vertices / 1000, faces) for key, (vertices, faces) in meshes.items()},
-        camera,
-        RenderSettings(),
-        TableSettings(),
-        log=tmp_path / "log",
-    )
-    caster = RayCaster({("model", key): mesh for key, mesh in meshes.items()})
+    session, caster = _session_and_caster(camera, meshes, tmp_path)
     compared = 0
     for drop in range(2):
         overrides = ["objects.count=[7, 9]", "camera.distance_m=[0.5, 0.8]", "camera.roll_deg=[-180, 180]"]
@@ -135,14 +142,7 @@ def test_pixels_and_poses_agree_for_any_camera(name: str, tmp_path: Path) -> Non
 def test_pixels_and_poses_agree_in_a_container(kind: str, tmp_path: Path) -> None:
     """Behind its sides and over its rim; the depth of the container itself is right, too."""
     camera, meshes = CAMERAS["off-centre"], _meshes()
-    session = BlenderSession(
-        {("model", key): Mesh(vertices / 1000, faces) for key, (vertices, faces) in meshes.items()},
-        camera,
-        RenderSettings(),
-        TableSettings(),
-        log=tmp_path / "log",
-    )
-    caster = RayCaster({("model", key): mesh for key, mesh in meshes.items()})
+    session, caster = _session_and_caster(camera, meshes, tmp_path)
     overrides = ["objects.count=[7, 9]", "camera.distance_m=[0.5, 0.6]", "camera.elevation_deg=[25, 35]"]
     spec, poses = _scene([*overrides, f"release.container={kind}"], dict.fromkeys(meshes, 0.06), 0)
     assert spec.container is not None and spec.container.kind == kind
