@@ -31,6 +31,7 @@ PHASES = {
     "guides": [("guides.py", "make_guides")],
     "cycles": [("render.py", "_rendered")],
     "denoise": [("denoise.py", "denoise")],
+    "refine": [("refine.py", "noisy_cells"), ("refine.py", "_sheet")],
     "develop": [("color.py", "exposure_gain"), ("color.py", "picture")],
     "encode": [("store.py", "_encode")],
     "commit": [("store.py", "commit")],

@@ -25,7 +25,10 @@ _LIBRARIES = (
     "libOpenImageDenoise.dylib",
     "*imagedenoise.dll",
 )
-_CPU, _FLOAT3, _HIGH = 1, 3, 6  # OIDN_DEVICE_TYPE_CPU, OIDN_FORMAT_FLOAT3, OIDN_QUALITY_HIGH
+_CPU, _FLOAT3 = 1, 3  # OIDN_DEVICE_TYPE_CPU, OIDN_FORMAT_FLOAT3
+_BALANCED = 5  # OIDN_QUALITY_BALANCED: in the time that the larger network takes more, paths gain more than it does
+_DARK = np.float32(1e-3)
+"""Added to an albedo that is divided by."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,15 +39,30 @@ class Guides:
         albedo: (H, W, 3) linear; 0 where there is no surface.
         normals: (H, W, 3) unit normals, averaged; 0 where there is no surface.
         known: (H, W) where the albedo is that of all that is seen.
+        textured: (H, W) where it is that of a texture alone, of no edge: the light may be taken for even there.
     """
 
     albedo: Image
     normals: Image
     known: NDArray[np.bool_]
+    textured: NDArray[np.bool_]
 
     def completed(self, sampled: Image) -> Guides:
         """With the albedo as it was sampled, (H, W, 3), where it is not known."""
         return replace(self, albedo=np.where(self.known[..., None], self.albedo, sampled))
+
+    def without_texture_noise(self, linear: Image, sampled: Image) -> Image:
+        """A noisy (H, W, 3) image with a pixel's texture as it is, not as the few paths met it.
+
+        Each path brings albedo times light; where the light is even, the mean of the products is the mean of the
+        albedos times the light, so the ratio of the true mean to the sampled one takes the texture's noise away.
+
+        Args:
+            linear: the image.
+            sampled: (H, W, 3) the albedo that its paths met.
+        """
+        ratio = (self.albedo + _DARK) / (sampled + _DARK)
+        return np.where(self.textured[..., None], linear * ratio, linear)
 
 
 class Denoiser:
@@ -65,32 +83,39 @@ class Denoiser:
         self._filter = call.oidnNewFilter(self._device, b"RT")  # kept: its weights are put in order only once
         self._refuse_error()
 
-    def denoise(self, linear: Image, guides: Guides) -> Image:
-        """(H, W, 3) of a noisy (H, W, 3) image of linear light.
+    def denoise(self, linear: Image, sampled: Image, guides: Guides) -> Image:
+        """(H, W, 3) without the noise.
+
+        Args:
+            linear: (H, W, 3) noisy image of linear light.
+            sampled: (H, W, 3) the albedo that was sampled with it.
+            guides: what is known of it.
 
         Raises:
             ValueError: the guides are not those of such an image.
             BlenderError: the library fails.
         """
-        call, result = self._library, np.empty_like(linear)
-        images = {
-            "color": np.ascontiguousarray(linear),
-            "albedo": np.ascontiguousarray(guides.albedo),
-            "normal": np.ascontiguousarray(guides.normals),
-            "output": result,
-        }
         height, width = linear.shape[:2]
-        for name, image in images.items():
+        for name, image in (("image", linear), ("albedo", guides.albedo), ("normals", guides.normals)):
             if image.dtype != np.float32 or image.shape != (height, width, 3):
                 raise ValueError(
                     f"{name} of shape {image.shape} and type {image.dtype}; float32 like the image is needed"
                 )
+        call, result = self._library, np.empty_like(linear, order="C")
+        images = {
+            "color": guides.without_texture_noise(linear, sampled),
+            "albedo": guides.completed(sampled).albedo,
+            "normal": guides.normals,
+            "output": result,
+        }
+        images = {name: np.ascontiguousarray(image) for name, image in images.items()}
+        for name, image in images.items():
             call.oidnSetSharedFilterImage(
                 self._filter, name.encode(), image.ctypes.data, _FLOAT3, width, height, 0, 0, 0
             )
         call.oidnSetFilterBool(self._filter, b"hdr", True)
         call.oidnSetFilterBool(self._filter, b"cleanAux", True)
-        call.oidnSetFilterInt(self._filter, b"quality", _HIGH)
+        call.oidnSetFilterInt(self._filter, b"quality", _BALANCED)
         call.oidnCommitFilter(self._filter)
         call.oidnExecuteFilter(self._filter)
         self._refuse_error()

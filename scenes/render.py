@@ -23,6 +23,7 @@ from synthetless.scenes.denoise import Denoiser, Guides
 from synthetless.scenes.environments import load_panorama
 from synthetless.scenes.lens import pinhole_around
 from synthetless.scenes.materials import TableTexture
+from synthetless.scenes.refine import noisy_cells, pixels_of, stencil
 from synthetless.scenes.rotations import matrix
 from synthetless.scenes.settings import RenderSettings, TableSettings
 from synthetless.scenes.spec import AmbientLight, EnvironmentSpec, Intrinsics, Mesh, Pose, Role, SceneSpec
@@ -199,10 +200,27 @@ class BlenderScene:
         if guides is None:
             raise ValueError("the guided denoiser needs guides")
         known = guides()
-        if known.known.all():
-            return self.session.denoiser.denoise(self._rendered(view), known)
-        passes = self._rendered(view, with_albedo=True)
-        return self.session.denoiser.denoise(passes[..., :3], known.completed(passes[..., 3:]))
+        sampled = (
+            self._refined(view) if self.session.settings.detail_samples else self._rendered(view, with_albedo=True)
+        )
+        return self.session.denoiser.denoise(sampled[..., :3], sampled[..., 3:], known)
+
+    def _refined(self, view: int) -> NDArray[np.float32]:
+        """The image and the albedo that was sampled, where it is noisiest by all of the settings' samples."""
+        bpy, cycles, settings = self.session.bpy, self.session.bpy.context.scene.cycles, self.session.settings
+        few, many = settings.samples, settings.detail_samples
+        cycles.samples, cycles.use_sample_subset = many, True
+        cycles.sample_offset, cycles.sample_subset_length = 0, few
+        image = self._rendered(view, with_albedo=True)
+        cells = noisy_cells(image[..., :3], image[..., 3:])
+        cycles.sample_offset, cycles.sample_subset_length = few, many - few
+        with stencil(bpy, bpy.context.scene.camera, self.session.pinhole, cells) as window:
+            more = self._rendered(view, with_albedo=True)
+        _configure(bpy.context.scene, settings)
+        noisy = pixels_of(cells, *image.shape[:2])[window]
+        seen = image[window]
+        seen[noisy] = (few * seen[noisy] + (many - few) * more[noisy]) / np.float32(many)
+        return image
 
     def _rendered(self, view: int, with_albedo: bool = False) -> NDArray[np.float32]:
         """The image as Cycles gives it; if wanted, the albedo that it sampled as three more channels."""
@@ -244,7 +262,7 @@ def read_exr(file: Path) -> NDArray[np.float32]:
 def _configure(scene: Any, settings: RenderSettings) -> None:
     scene.render.engine = "CYCLES"
     cycles = scene.cycles
-    cycles.samples = settings.samples
+    cycles.samples, cycles.use_sample_subset = settings.samples, False
     cycles.use_adaptive_sampling = False  # gains nothing at these sample counts
     cycles.max_bounces = settings.bounces
     cycles.diffuse_bounces = cycles.glossy_bounces = settings.bounces

@@ -313,11 +313,13 @@ class TableSettings(Settings):
 
 
 QUALITIES: dict[str, dict[str, Any]] = {
-    "draft": {"samples": 2, "denoiser": "guided"},
-    "standard": {"samples": 7, "denoiser": "guided"},
-    "reference": {"samples": 256, "denoiser": "accurate"},
+    "draft": {"samples": 1, "detail_samples": 6, "denoiser": "guided"},
+    "standard": {"samples": 3, "detail_samples": 12, "denoiser": "guided"},
+    "reference": {"samples": 256, "detail_samples": 0, "denoiser": "accurate"},
 }
 """What the named qualities stand for; how near each comes to a converged render is in docs/scaling.md."""
+_UNGUIDED_SAMPLES = {"draft": 4, "standard": 12}
+"""What they take with Blender's own denoiser, or none."""
 
 
 class RenderSettings(Settings):
@@ -327,6 +329,9 @@ class RenderSettings(Settings):
     """Sets samples and denoiser: draft to try a recipe out, standard to train with, reference to compare with."""
     samples: Annotated[int, Bounds(1, 65536, "samples")] = QUALITIES["standard"]["samples"]
     """Light paths per pixel; if not given, those of the quality."""
+    detail_samples: Annotated[int, Bounds(0, 65536, "samples")] = QUALITIES["standard"]["detail_samples"]
+    """Light paths per pixel in the fifth of an image that is noisiest, with the guided denoiser; 0 for no more than
+    elsewhere; if not given, those of the quality, where they are more than samples."""
     denoiser: Literal["none", "guided", "fast", "accurate"] = QUALITIES["standard"]["denoiser"]
     """Open Image Denoise with albedo and normal guides: none; guided, by guides without noise, from the geometry; or as
     Blender calls it, fast (guides as sampled) or accurate (guides denoised first); if not given, the quality's."""
@@ -345,7 +350,25 @@ class RenderSettings(Settings):
         if not isinstance(given, dict):
             return given
         quality = given.get("quality", "standard")
-        return {**QUALITIES.get(quality, {}), **given} if isinstance(quality, str) else given
+        if not isinstance(quality, str) or quality not in QUALITIES:
+            return given
+        follows = dict(QUALITIES[quality])
+        if given.get("denoiser", follows["denoiser"]) != "guided":
+            follows["samples"], follows["detail_samples"] = _UNGUIDED_SAMPLES.get(quality, follows["samples"]), 0
+        samples = given.get("samples", 0)
+        if isinstance(samples, int) and samples >= follows["detail_samples"]:
+            follows["detail_samples"] = 0
+        return {**follows, **given}
+
+    @model_validator(mode="after")
+    def _refine_what_can_be(self) -> Self:
+        if self.detail_samples and self.denoiser != "guided":
+            raise ValueError(
+                f"detail_samples = {self.detail_samples} needs the guided denoiser, not {self.denoiser}; give 0"
+            )
+        if 0 < self.detail_samples <= self.samples:
+            raise ValueError(f"detail_samples = {self.detail_samples} must be more than samples = {self.samples}, or 0")
+        return self
 
 
 SENSORS: dict[str, dict[str, Any]] = {

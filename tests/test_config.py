@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -184,7 +185,22 @@ def test_a_quality_sets_what_is_not_given() -> None:
     assert draft.samples < standard.samples < load_recipe(None, ["render.quality=reference"]).render.samples
     assert draft.denoiser == "guided"
     mixed = load_recipe(None, ["render.quality=draft", "render.samples=77"]).render
-    assert (mixed.samples, mixed.denoiser) == (77, "guided")
+    assert (mixed.samples, mixed.detail_samples, mixed.denoiser) == (77, 0, "guided")
+    assert load_recipe(None, ["render.samples=5"]).render.detail_samples == standard.detail_samples
+    unguided = load_recipe(None, ["render.denoiser=fast"]).render
+    assert (unguided.samples, unguided.detail_samples) == (12, 0), "as many as it takes without guides"
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (["render.samples=8", "render.detail_samples=8"], "detail_samples = 8 must be more than samples = 8, or 0"),
+        (["render.denoiser=fast", "render.detail_samples=20"], "needs the guided denoiser, not fast; give 0"),
+    ],
+)
+def test_samples_that_could_not_be_spent_are_refused(given: list[str], told: str) -> None:
+    with pytest.raises(RecipeError, match=re.escape(told)):
+        load_recipe(None, given)
 
 
 @pytest.mark.parametrize("quality", ["draft", "standard", "reference"])

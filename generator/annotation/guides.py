@@ -60,7 +60,9 @@ def make_guides(
     albedo = colours.take(owner, axis=0, mode="wrap")
     known = told.take(owner, mode="wrap")
     on_table = (owner == len(bodies)).astype(np.float32)
-    rows, columns = pixels_where(_has_edge(owner, normals))
+    near_edge = _has_edge(owner, normals)
+    textured = (owner == len(bodies)) & ~near_edge
+    rows, columns = pixels_where(near_edge)
     finer = caster.surfaces_between(camera, plane, bodies, np.stack([columns, rows], axis=1), _points_px())
     albedo[rows, columns] = colours.take(finer[0], axis=0, mode="wrap").mean(axis=1)
     known[rows, columns] = told.take(finer[0], mode="wrap").all(axis=1)
@@ -68,7 +70,7 @@ def make_guides(
     on_table[rows, columns] = (finer[0] == len(bodies)).mean(axis=1)
     if on_table.any():
         albedo += on_table[..., None] * table_albedo(camera, plane, texture, on_table > 0)
-    return Guides(albedo, normals, known)
+    return Guides(albedo, normals, known, textured)
 
 
 def _has_edge(owner: NDArray[np.int32], normals: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -182,7 +182,14 @@ class DatasetStore:
             UserError: it was begun from others, or dataset.json is missing or damaged.
         """
         begun_with = read_recipe(root)  # with today's defaults for settings that it did not know
-        before = {**read_json(root / DATASET_FILE), "recipe": dump_recipe(begun_with)}
+        header = read_json(root / DATASET_FILE)
+        rendered = header["recipe"].get("render", {})
+        if rendered.get("denoiser") == "guided" and "detail_samples" not in rendered:
+            raise DatasetError(
+                f"{root / DATASET_FILE}: was begun with an earlier guided denoiser, which is gone; "
+                "use another output folder"
+            )
+        before = {**header, "recipe": dump_recipe(begun_with)}
         _refuse_other(root / DATASET_FILE, before, _header(recipe, models, scenery_digest))
         return cls(root, recipe.model_copy(update={"images": max(recipe.images, begun_with.images)}))
 
