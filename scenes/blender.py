@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from synthetless.extras import MissingExtraError
+from synthetless.extras import MissingExtraError, cv2
 
 Kind = Literal["cpu", "optix", "cuda", "hip", "oneapi", "metal"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -42,7 +42,7 @@ def start(threads: int = 0, device: RenderDevice = CPU) -> Any:
     """Import bpy, empty its start-up scene and choose what Cycles computes on.
 
     Args:
-        threads: of the renderer; 0 uses every core.
+        threads: of the renderer, and of what else computes in this process; 0 uses every core.
         device: what to render on.
 
     Returns:
@@ -63,6 +63,7 @@ def start(threads: int = 0, device: RenderDevice = CPU) -> Any:
     render.threads_mode = "FIXED" if threads else "AUTO"
     if threads:
         render.threads = threads
+        _limit_libraries(threads)
     if device.kind != "cpu":
         _compute_on(bpy, device)
     return bpy
@@ -101,6 +102,14 @@ def _one_core() -> Iterator[None]:
     finally:
         for thread in Path("/proc/self/task").iterdir():
             os.sched_setaffinity(int(thread.name), cores)
+
+
+def _limit_libraries(threads: int) -> None:
+    """Have NumPy and OpenCV use so many threads; NumPy's wait for one another in busy loops, like the denoiser's."""
+    import threadpoolctl
+
+    threadpoolctl.threadpool_limits(threads, user_api="blas")
+    cv2.setNumThreads(threads)
 
 
 def _compute_on(bpy: Any, device: RenderDevice) -> None:

@@ -74,13 +74,17 @@ def test_a_device_that_is_not_there_is_refused() -> None:
 
 @pytest.mark.blender
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="only Linux tells a process its cores")
-def test_one_thread_is_one_thread_for_the_denoiser_too(tmp_path: Path) -> None:
+def test_one_thread_is_one_thread_for_all_that_computes(tmp_path: Path) -> None:
     code = f"""
 import os
 from pathlib import Path
+import cv2, numpy, scipy.linalg, threadpoolctl
 from synthetless.scenes import blender
 cores = os.sched_getaffinity(0)
 bpy = blender.start(1)
+blas = [library for library in threadpoolctl.threadpool_info() if library["user_api"] == "blas"]
+assert blas and all(library["num_threads"] == 1 for library in blas), blas
+assert cv2.getNumThreads() == 1
 assert all(os.sched_getaffinity(int(thread)) == cores for thread in os.listdir("/proc/self/task"))
 scene = bpy.context.scene
 scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1, True
