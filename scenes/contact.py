@@ -36,6 +36,7 @@ class Surface:
 
     Attributes:
         vertices_m: (V, 3) those that belong to a triangle.
+        box_m: (2, 3) their smallest and largest coordinates.
         points_m: (N, 3) samples of the surface; every point of it has one within ``spacing_m``.
         spacing_m: distance of neighbouring samples.
     """
@@ -43,6 +44,7 @@ class Surface:
     def __init__(self, mesh: Mesh) -> None:
         self._triangles: Array = mesh.vertices_m[mesh.faces]
         self.vertices_m: Array = mesh.vertices_m[np.unique(mesh.faces)]
+        self.box_m: Array = np.array([self.vertices_m.min(axis=0), self.vertices_m.max(axis=0)])
         self._size = float(np.ptp(self.vertices_m, axis=0).max())
         self.spacing_m = self._size / SAMPLES_PER_SIDE
         points, faces = _sample(self._triangles, self.spacing_m)
@@ -65,6 +67,7 @@ class Surface:
 
     def near(self, points_m: Array, distance_m: float, most: int) -> Array:
         """Of the points that have a sample within a distance, the nearest ones."""
+        points_m = _inside_box(points_m, self.box_m[0] - distance_m, self.box_m[1] + distance_m)
         distances, _ = self._tree.query(points_m, distance_upper_bound=distance_m)
         order = np.argsort(distances, kind="stable")[:most]
         return np.asarray(points_m[order[np.isfinite(distances[order])]])
@@ -154,8 +157,7 @@ def _inside_box(points: Array, low: Array, high: Array) -> Array:
 def _depth(points_m: Array, other: Posed) -> float:
     """How far inside the other the deepest of some points (world) is."""
     local = other.to_model(points_m)
-    vertices = other.surface.vertices_m
-    local = _inside_box(local, vertices.min(axis=0), vertices.max(axis=0))
+    local = _inside_box(local, *other.surface.box_m)
     local = local[other.surface.contains(local)]
     return float(other.surface.closest(local)[1].max()) if len(local) else 0.0
 
