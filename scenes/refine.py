@@ -42,7 +42,7 @@ def noisy_cells(light: Image, albedo: Image) -> Mask:
 
     Args:
         light: (H, W, 3) of few paths per pixel, linear.
-        albedo: (H, W, 3) that the same paths met.
+        albedo: (H, W, 3) of what is seen there, with as little noise as can be.
     """
     luminance: NDArray[np.float32] = light @ LUMINANCE_WEIGHTS
     irradiance: NDArray[np.float32] = luminance / (albedo @ LUMINANCE_WEIGHTS + np.float32(_DARK))

@@ -200,19 +200,21 @@ class BlenderScene:
         if guides is None:
             raise ValueError("the guided denoiser needs guides")
         known = guides()
-        sampled = (
-            self._refined(view) if self.session.settings.detail_samples else self._rendered(view, with_albedo=True)
-        )
+        if self.session.settings.detail_samples:
+            sampled = self._refined(view, known)
+        else:
+            sampled = self._rendered(view, with_albedo=True)
         return self.session.denoiser.denoise(sampled[..., :3], sampled[..., 3:], known)
 
-    def _refined(self, view: int) -> NDArray[np.float32]:
+    def _refined(self, view: int, guides: Guides) -> NDArray[np.float32]:
         """The image and the albedo that was sampled, where it is noisiest by all of the settings' samples."""
         bpy, cycles, settings = self.session.bpy, self.session.bpy.context.scene.cycles, self.session.settings
         few, many = settings.samples, settings.detail_samples
         cycles.samples, cycles.use_sample_subset = many, True
         cycles.sample_offset, cycles.sample_subset_length = 0, few
         image = self._rendered(view, with_albedo=True)
-        cells = noisy_cells(image[..., :3], image[..., 3:])
+        light, albedo = image[..., :3], image[..., 3:]
+        cells = noisy_cells(guides.without_texture_noise(light, albedo), guides.completed(albedo).albedo)
         cycles.sample_offset, cycles.sample_subset_length = few, many - few
         with stencil(bpy, bpy.context.scene.camera, self.session.pinhole, cells) as window:
             more = self._rendered(view, with_albedo=True)

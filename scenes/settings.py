@@ -314,7 +314,7 @@ class TableSettings(Settings):
 
 QUALITIES: dict[str, dict[str, Any]] = {
     "draft": {"samples": 1, "detail_samples": 6, "denoiser": "guided"},
-    "standard": {"samples": 3, "detail_samples": 12, "denoiser": "guided"},
+    "standard": {"samples": 2, "detail_samples": 11, "denoiser": "guided"},
     "reference": {"samples": 256, "detail_samples": 0, "denoiser": "accurate"},
 }
 """What the named qualities stand for; how near each comes to a converged render is in docs/scaling.md."""

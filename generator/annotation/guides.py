@@ -1,14 +1,14 @@
 """What a denoiser may know of an image before it is rendered: albedo and normals of the surfaces, without noise.
 
-Both are means over the same points of a pixel, weighed as Cycles weighs its samples. Where no edge is near one ray is
-enough. The table's texture is looked up at every point, in a copy whose texels are about as large as the points are
-apart (L. Williams, Pyramidal parametrics, 1983).
+Both are means over a pixel, weighed as Cycles weighs its samples. Where no edge is near, one ray tells the surface;
+near an edge, several do. The table's texture is looked up on a grid finer than the pixels, whose points neighbours
+share, in a copy with texels that are not much smaller than the points are apart (L. Williams, Pyramidal parametrics,
+1983).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +22,21 @@ from synthetless.scenes.materials import TableTexture, table_uv
 from synthetless.scenes.spec import Intrinsics, Vector
 from synthetless.scenes.srgb import linear_from_srgb
 
+_RADIUS_PX = 1.5
+"""Of Cycles' pixel filter, Blackman-Harris: half of what its width of 1.5 is in its own units."""
 _SPREAD_PX = 0.36
-"""Standard deviation of Cycles' pixel filter, along each axis: Blackman-Harris, whose width is 1.5 in its units."""
+"""Standard deviation of that filter, along each axis."""
 _POINTS = 16
-"""Points of a pixel that its albedo and normal are means over."""
-_TEXEL_SHARE = 0.5
-"""Side of a texel of the copy that is looked up, as a share of a pixel's: several points of a pixel share a texel."""
-_SAME_COS = 0.98
-"""Two neighbours with normals as near as this have no edge between them."""
+"""Points of a pixel near an edge that its albedo and normal are means over."""
+_GRID = 2
+"""Points per pixel, along each axis, at which the table's texture is looked up."""
+_TEXEL_SHARE = 0.25
+"""Side of a texel of the copy that is looked up, as a share of a pixel's, up to a factor of the square root of 2."""
+_BAND = 64
+"""Rows of pixels that are looked up at a time, so that they stay in the processor's cache."""
+_SAME_COS = 0.9
+"""Two neighbours with normals as near as this have no edge between them: it would be shaded as a curve."""
+_HORIZON = np.float32(1e-6)
 _MM = 1000.0
 
 Image = NDArray[np.float32]
@@ -74,12 +81,14 @@ def make_guides(
 
 
 def _has_edge(owner: NDArray[np.int32], normals: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(H, W) whether a pixel or one of its eight neighbours shows another surface, or the same one bent."""
-    edge = np.zeros(owner.shape, dtype=np.uint8)
+    """(H, W) whether a pixel or one of its four neighbours shows another surface, or the same one bent."""
+    edge = np.zeros(owner.shape, dtype=bool)
     for one, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
         bent = np.einsum("ijk,ijk->ij", normals[one], normals[other]) < _SAME_COS
-        edge[one] |= bent | (owner[one] != owner[other])
-    return np.asarray(cv2.dilate(edge, np.ones((3, 3), np.uint8)), dtype=bool)
+        between = bent | (owner[one] != owner[other])
+        edge[one] |= between
+        edge[other] |= between
+    return edge
 
 
 def _points_px() -> NDArray[np.float64]:
@@ -93,67 +102,93 @@ def _points_px() -> NDArray[np.float64]:
 
 def table_albedo(camera: Intrinsics, plane: Plane, texture: TableTexture, wanted: NDArray[np.bool_]) -> Image:
     """(H, W, 3) linear albedo of the table, averaged over each pixel that is wanted; 0 elsewhere."""
-    rows, columns = pixels_where(wanted)
     to_texels = _homography(camera, plane, texture)
-    at, right, below = (_mapped(to_texels, columns + u, rows + v) for u, v in ((0, 0), (1, 0), (0, 1)))
-    pixel_side = np.sqrt(np.hypot(*(right - at)) * np.hypot(*(below - at)))  # in texels, the mean of a long and a short
-    pyramid = _pyramid(texture.pixels)
-    level = np.minimum(np.rint(np.log2(np.maximum(_TEXEL_SHARE * pixel_side, 1.0))), len(pyramid) - 1)
+    levels = _pyramid(texture.pixels)
     result = np.zeros((*wanted.shape, 3), dtype=np.float32)
-    for number in np.unique(level):
-        chosen = np.flatnonzero(level == number)
-        row, column = rows[chosen], columns[chosen]
-        seen = (_mapped(to_texels, column + u, row + v) for u, v in _points_px())
-        copy = pyramid[int(number)]
-        result[row, column] = sum(_looked_up(copy, place, texture) for place in seen) / np.float32(_POINTS)
+    u = _grid(0, wanted.shape[1])
+    for top in range(0, wanted.shape[0], _BAND):
+        band = wanted[top : top + _BAND]
+        v = _grid(top, len(band))
+        x, y, scale = (
+            (row[0] * u).astype(np.float32) + (row[1] * v + row[2]).astype(np.float32)[:, None] for row in to_texels
+        )
+        np.maximum(scale, _HORIZON, out=scale)
+        x, y = x / scale, y / scale
+        at_pixels = scale[_GRID:-_GRID:_GRID, _GRID:-_GRID:_GRID]
+        side = np.sqrt(abs(np.linalg.det(to_texels)) / at_pixels**3)  # in texels: of the square of the same area
+        level = np.minimum(np.rint(np.log2(np.maximum(_TEXEL_SHARE * side, 1.0))), len(levels) - 1)
+        for number in np.unique(level[band]):
+            seen = _averaged(_looked_up(levels[int(number)], x, y, texture))
+            np.copyto(result[top : top + _BAND], seen, where=(band & (level == number))[..., None])
     return result
 
 
-def _mapped(homography: NDArray[np.float64], u: NDArray[Any], v: NDArray[Any]) -> NDArray[np.float64]:
-    """(2, N) images of points."""
-    x, y, scale = (row[0] * u + (row[1] * v + row[2]) for row in homography)
-    return np.stack([x / scale, y / scale])
+def _grid(first: int, count: int) -> NDArray[np.float64]:
+    """The points along an axis that some pixels are averaged over: those of one pixel more on either side."""
+    return first - 1 + (np.arange(_GRID * (count + 2)) - (_GRID - 1) / 2) / _GRID
+
+
+def _averaged(seen: Image) -> Image:
+    """(H, W, 3) means by the pixel filter of what is seen at the points of ``_grid``."""
+    offsets = (np.arange(3 * _GRID) - (3 * _GRID - 1) / 2) / _GRID
+    terms = (0.35875, 0.48829, 0.14128, 0.01168)  # F. J. Harris, On the use of windows for harmonic analysis, 1978
+    weights = sum(term * np.cos(np.pi * order * offsets / _RADIUS_PX) for order, term in enumerate(terms))
+    kernel = (weights / np.sum(weights)).astype(np.float32)
+    rows, columns = (side - 2 * _GRID for side in seen.shape[:2])
+    across = cv2.filter2D(seen, -1, kernel[None], anchor=(0, 0))[:, :columns:_GRID]
+    down = cv2.filter2D(np.ascontiguousarray(across), -1, kernel[:, None], anchor=(0, 0))[:rows:_GRID]
+    return np.asarray(down, dtype=np.float32)
 
 
 def _homography(camera: Intrinsics, plane: Plane, texture: TableTexture) -> NDArray[np.float64]:
-    """(3, 3) from a pixel (u, v, 1) to what it sees of the table: column and row in the texture, tiles counted on."""
+    """(3, 3) from a pixel (u, v, 1) to what it sees of the table: column and row in the texture, tiles counted on.
+
+    The third of what comes out is positive where the table is seen, and 0 at its horizon.
+    """
     height, width = texture.pixels.shape[:2]
     corners = table_uv(texture.plane, np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), width / height)
     to_uv = np.column_stack([corners[1] - corners[0], corners[2] - corners[0], corners[0]])
     to_texture = np.array([[width, 0.0, 0.0], [0.0, -height, height], [0.0, 0.0, 1.0]])  # the first row is on top
     origin_m = -plane.t_w2c @ plane.R_w2c / _MM
     rays = np.linalg.inv([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-    to_plane = np.array([[-origin_m[2], 0.0, origin_m[0]], [0.0, -origin_m[2], origin_m[1]], [0.0, 0.0, 1.0]])
+    to_plane = -np.sign(origin_m[2]) * np.array(
+        [[-origin_m[2], 0, origin_m[0]], [0, -origin_m[2], origin_m[1]], [0, 0, 1]]
+    )
     homography: NDArray[np.float64] = to_texture @ np.vstack([to_uv, [0.0, 0.0, 1.0]]) @ to_plane @ plane.R_w2c.T @ rays
     return homography
 
 
-def _pyramid(pixels: NDArray[np.uint8]) -> list[Image]:
-    """The texture in linear light, and copies of half the size of the one before."""
-    linear = np.array([linear_from_srgb(value / 255) for value in range(256)], dtype=np.float32)
-    levels: list[Image] = [np.asarray(cv2.LUT(pixels, linear), dtype=np.float32)]
-    while min(levels[-1].shape[:2]) > 1:
-        height, width = levels[-1].shape[:2]
-        smaller = cv2.resize(levels[-1], (max(1, width // 2), max(1, height // 2)), interpolation=cv2.INTER_AREA)
-        levels.append(np.asarray(smaller, dtype=np.float32))
+def _pyramid(pixels: NDArray[np.uint8]) -> list[NDArray[np.uint8] | Image]:
+    """The texture, and copies in linear light of half the size of the one before."""
+    levels: list[NDArray[np.uint8] | Image] = [pixels]
+    smaller = np.asarray(cv2.LUT(pixels, _linear()), dtype=np.float32)
+    while min(smaller.shape[:2]) > 1:
+        height, width = smaller.shape[:2]
+        size = max(1, width // 2), max(1, height // 2)
+        smaller = np.asarray(cv2.resize(smaller, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+        levels.append(smaller)
     return levels
 
 
-_ROW = 1024
-"""OpenCV looks up images of at most 32767 pixels a side: a list of pixels is made an image of this width."""
+def _linear() -> NDArray[np.float32]:
+    """(256,) the linear light that sRGB's values stand for."""
+    return np.array([linear_from_srgb(value / 255) for value in range(256)], dtype=np.float32)
 
 
-def _looked_up(level: Image, texels: NDArray[np.float64], texture: TableTexture) -> Image:
-    """(N, 3) of a level of the pyramid, interpolated at texels (2, N) of the full texture."""
-    padded = np.zeros((2, -(-texels.shape[1] // _ROW), _ROW), dtype=np.float32)
-    for axis, side in enumerate(level.shape[1::-1]):
-        at = texels[axis] * (side / texture.pixels.shape[1 - axis])
-        if texture.seamless:
-            at = np.mod(at, side)
-        else:
-            at = np.mod(at, 2 * side)
-            at = np.minimum(at, 2 * side - at)
-        padded[axis].ravel()[: len(at)] = at - 0.5
-    border = cv2.BORDER_WRAP if texture.seamless else cv2.BORDER_REPLICATE
-    found = cv2.remap(level, padded[0], padded[1], cv2.INTER_LINEAR, borderMode=border)
-    return np.asarray(found, dtype=np.float32).reshape(-1, 3)[: texels.shape[1]]
+def _looked_up(
+    level: NDArray[np.uint8] | Image, x: NDArray[np.float32], y: NDArray[np.float32], texture: TableTexture
+) -> Image:
+    """(H, W, 3) of a level of the pyramid, interpolated at texels (H, W) of the full texture."""
+    repeated = texture.seamless
+
+    def folded(texels: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
+        side = np.float32(level.shape[axis])
+        place = texels * np.float32(side / texture.pixels.shape[axis])
+        period = side if repeated else 2 * side
+        place -= period * np.floor(place / period)
+        return (place if repeated else np.minimum(place, period - place)) - np.float32(0.5)
+
+    border = cv2.BORDER_WRAP if repeated else cv2.BORDER_REPLICATE
+    found = cv2.remap(level, folded(x, 1), folded(y, 0), cv2.INTER_LINEAR, borderMode=border)
+    # Like Cycles, which interpolates what an image file says, and makes light of it then.
+    return np.asarray(cv2.LUT(found, _linear()) if found.dtype == np.uint8 else found, dtype=np.float32)
