@@ -204,13 +204,14 @@ def _relabel_shard(task: ShardTask) -> int:
 
 
 def _image_members(image: ShardImage) -> Members:
-    """What there is of the image's files: colour and depth as they are, masks as run lengths."""
+    """What there is of the image's files: colour and depths as they are, masks as run lengths."""
     scene, members = image.scene, {}
     for extension in ("png", "jpg"):
         if (path := scene.rgb(image.im_id, extension)).exists():
             members[f"rgb.{extension}"] = read_bytes(path)
-    if (path := scene.depth(image.im_id)).parent.is_dir():
-        members["depth.png"] = read_bytes(path)
+    for name, path in (("depth", scene.depth(image.im_id)), ("depth_sensed", scene.depth_sensed(image.im_id))):
+        if path.parent.is_dir():
+            members[f"{name}.png"] = read_bytes(path)
     known: dict[bytes, RunLengths] = {}
     for name, mask in (("mask", scene.mask), ("mask_visib", scene.mask_visib)):
         if (scene.root / name).is_dir():

@@ -182,7 +182,8 @@ def _contents(scene: SceneRecords, im_id: int) -> dict[str, Any]:
 
 def _files(source: Source, paths: ScenePaths, im_id: int) -> dict[str, Path]:
     extension = source.recipe.encoding.rgb_format
-    files = {f"rgb.{extension}": paths.rgb(im_id, extension), "depth.png": paths.depth(im_id)}
+    depths = {"depth.png": paths.depth(im_id), "depth_sensed.png": paths.depth_sensed(im_id)}
+    files = {f"rgb.{extension}": paths.rgb(im_id, extension), **depths}
     return {name: path for name, path in files.items() if path.exists()}
 
 

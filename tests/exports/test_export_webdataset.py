@@ -165,6 +165,18 @@ def test_what_was_not_generated_is_left_out(dataset: Path, tmp_path: Path) -> No
     assert set(_samples(tmp_path / "web")["000001_000000"]) == MEMBERS - {"depth.png", "mask.json"}
 
 
+@pytest.mark.parametrize("name", ["depth", "depth_sensed"])
+def test_each_kind_of_depth_is_there_if_the_dataset_has_it(dataset: Path, tmp_path: Path, name: str) -> None:
+    copy = shutil.copytree(dataset, tmp_path / "copy")
+    for scene_id in (1, 2):
+        folder = ScenePaths.of(copy, scene_id).root
+        (folder / "depth").rename(folder / name)
+    export_webdataset(copy, tmp_path / "web", workers=1)
+    sample = _samples(tmp_path / "web")["000001_000000"]
+    assert set(sample) == MEMBERS - {"depth.png"} | {f"{name}.png"}
+    assert sample[f"{name}.png"] == (ScenePaths.of(copy, 1).root / name / "000000.png").read_bytes()
+
+
 def test_the_webdataset_package_reads_the_shards(dataset: Path, tmp_path: Path) -> None:
     webdataset = pytest.importorskip("webdataset")
     export_webdataset(dataset, tmp_path / "web", images_per_shard=4, shuffle_seed=0, workers=1)

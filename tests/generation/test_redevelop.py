@@ -27,7 +27,7 @@ from synthetless.scenes.sensor import capture, expose
 from synthetless.scenes.settings import SensorSettings
 from synthetless.validation import validate
 
-OUTPUTS = "outputs=[rgb, depth, masks, normals, object_coordinates, exr]"
+OUTPUTS = "outputs=[rgb, depth, depth_sensed, masks, normals, object_coordinates, exr]"
 TOLD_OF_PICTURES = {"README.md", "preview.jpg"}
 
 
