@@ -1,16 +1,20 @@
 """How near each quality comes to a converged render: ``python -m benchmarks.quality [--models DIR] [--textures DIR]``.
 
-Scenes of the T-LESS recipe with 10 objects, at half the width and height (finer detail per pixel, so harder, and four
-times as fast). Each image is compared as it is written, PNG or JPEG file included, with the same scene at so many
-samples that its noise no longer counts; PSNR in dB and SSIM on sRGB values, the mean over the scenes. CPU seconds are
-of rendering alone. The converged renders are kept in benchmarks/results and used again.
+Scenes of the T-LESS recipe with 10 objects, three of the built-in parts and, if a folder is given, three of its models.
+They are rendered at half the width and height (finer detail per pixel, so harder, and four times as fast), or with
+``--full`` at 720x540. Each image is compared as it is written, PNG or JPEG file included, with the same scene at many
+samples, without a denoiser. Of those there are two, with noise that is independent, so that their noise drops out: the
+error's mean square is the mean product of the errors against the one and the other, and likewise for the variances of
+SSIM. PSNR in dB and SSIM on sRGB values; CPU seconds are of rendering alone, guides included. The converged renders are
+kept in benchmarks/results and used again; ``--pictures DIR`` writes what was compared.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -23,96 +27,145 @@ from synthetless.generation.drop import DropRenderer
 from synthetless.generation.sources import load_sources
 from synthetless.io.color import exposure_gain, tonemap
 from synthetless.io.images import decode_rgb, encode_jpeg, encode_png
-from synthetless.scenes.render import BlenderSession
 from synthetless.scenes.settings import RenderSettings
+from synthetless.scenes.spec import Pose, SceneSpec
 
-SHRINK = 2
-
-Encoder = Callable[[NDArray[np.uint8]], bytes]
+Image = NDArray[np.uint8]
+Encoder = Callable[[Image], bytes]
 
 CANDIDATES: dict[str, tuple[RenderSettings, Encoder]] = {
     "draft": (RenderSettings(quality="draft"), encode_png),
     "standard": (RenderSettings(quality="standard"), encode_png),
     "standard, JPEG 98": (RenderSettings(quality="standard"), lambda rgb: encode_jpeg(rgb, 98)),
+    "4 fast": (RenderSettings(samples=4, denoiser="fast"), encode_png),
+    "12 fast": (RenderSettings(samples=12, denoiser="fast"), encode_png),
+    "50 accurate, JPEG 95": (RenderSettings(samples=50, denoiser="accurate"), lambda rgb: encode_jpeg(rgb, 95)),
     "reference": (RenderSettings(quality="reference"), encode_png),
-    "50 samples, accurate, JPEG 95": (RenderSettings(samples=50), lambda rgb: encode_jpeg(rgb, 95)),
-    "250 samples, no denoiser": (RenderSettings(samples=250, denoiser="none"), encode_png),
 }
+_OTHER_NOISE = 10**6
+"""Added to a drop's number, from which Cycles' noise follows."""
 
 
 def main() -> None:
     """Render, compare, print a table, write benchmarks/results/quality.json."""
     options = parser(__doc__)
-    options.add_argument("--scenes", type=int, default=3)
-    options.add_argument("--samples", type=int, default=4096, help="of the converged renders")
+    options.add_argument("--scenes", type=int, default=3, help="of each set of models")
+    options.add_argument("--samples", type=int, default=512, help="of each of the two converged renders")
+    options.add_argument("--full", action="store_true", help="at 720x540")
+    options.add_argument("--candidates", nargs="+", choices=CANDIDATES, default=list(CANDIDATES))
+    options.add_argument("--pictures", type=Path, help="folder for what was compared")
     arguments = options.parse_args()
-    recipe = bench_recipe(arguments)
-    renderer = DropRenderer(recipe, load_sources(recipe), threads=1)
-    rows: dict[str, list[tuple[float, float, float, float]]] = {name: [] for name in CANDIDATES}
-    for drop in range(arguments.scenes):
-        spec, settled = renderer.drop(drop)
-        with renderer.session.scene(spec, settled) as scene:
-            reference = converged(renderer.session, lambda: scene.render(0), recipe, drop, arguments.samples)
-            for name, (settings, encode) in CANDIDATES.items():
-                renderer.session.configure(settings)
-                began = time.process_time()
-                linear = renderer.render(scene, settled, 0)
-                spent = time.process_time() - began
-                gain = exposure_gain(linear, recipe.render.exposure)
-                content = encode(tonemap(linear, gain))
-                pair = decode_rgb(content), tonemap(reference, gain)
-                rows[name].append((psnr(*pair), ssim(*pair), spent, len(content) / 1000))
-                print(drop, name, *(f"{value:.3f}" for value in rows[name][-1]), flush=True)
+    rows: dict[str, dict[str, list[tuple[float, ...]]]] = {}
+    for models, textures in dict.fromkeys([("builtin", "builtin"), (arguments.models, arguments.textures)]):
+        recipe = bench_recipe(argparse.Namespace(models=models, textures=textures), arguments.full)
+        renderer = DropRenderer(recipe, load_sources(recipe), threads=1)
+        for drop in range(arguments.scenes):
+            name = f"{Path(models).name}_{drop}"
+            for candidate, row in compare(renderer, recipe, drop, name, arguments).items():
+                rows.setdefault(Path(models).name, {}).setdefault(candidate, []).append(row)
+                print(name, candidate, *(f"{value:.4f}" for value in row), flush=True)
+    rows["all"] = {name: [row for found in list(rows.values()) for row in found[name]] for name in arguments.candidates}
     columns = ("psnr_db", "ssim", "cpu_s", "kilobytes")
-    table = {name: dict(zip(columns, np.mean(row, axis=0).round(4), strict=True)) for name, row in rows.items()}
-    for name, row in table.items():
-        print(f"{name:32}" + "".join(f"{column} {row[column]:8.3f}   " for column in columns))
-    keep("quality", table)
+    table = {
+        of: {
+            name: dict(zip(columns, np.mean(row, axis=0).round(4).tolist(), strict=True)) for name, row in found.items()
+        }
+        for of, found in rows.items()
+    }
+    for of, found in table.items():
+        for name, measured in found.items():
+            print(f"{of:12} {name:24}" + "".join(f"{column} {measured[column]:8.4f}   " for column in columns))
+    keep("quality_full" if arguments.full else "quality", table)
 
 
-def bench_recipe(arguments: argparse.Namespace) -> Recipe:
-    """The T-LESS recipe with 10 objects, one view a drop, at a smaller size."""
+def compare(
+    renderer: DropRenderer, recipe: Recipe, drop: int, name: str, arguments: argparse.Namespace
+) -> dict[str, tuple[float, ...]]:
+    """PSNR, SSIM, CPU seconds and kilobytes of each candidate for one scene."""
+    spec, settled = renderer.drop(drop)
+    truth = [converged(renderer, spec, settled, name, half, arguments) for half in (0, 1)]
+    gain = exposure_gain((truth[0] + truth[1]) / 2, recipe.render.exposure)
+    halves = [tonemap(half, gain) for half in truth]
+    found: dict[str, tuple[float, ...]] = {}
+    with renderer.session.scene(spec, settled) as scene:
+        for candidate in arguments.candidates:
+            settings, encode = CANDIDATES[candidate]
+            renderer.session.configure(settings)
+            began = time.process_time()
+            linear = renderer.render(scene, settled, 0)
+            spent = time.process_time() - began
+            content = encode(tonemap(linear, gain))
+            image = decode_rgb(content)
+            found[candidate] = psnr(image, halves), ssim(image, halves), spent, len(content) / 1000
+            if arguments.pictures:
+                write(arguments.pictures / f"{name}_{candidate.replace(' ', '_').replace(',', '')}.png", image)
+    if arguments.pictures:
+        write(arguments.pictures / f"{name}_converged.png", tonemap((truth[0] + truth[1]) / 2, gain))
+    return found
+
+
+def bench_recipe(arguments: argparse.Namespace, full: bool = False) -> Recipe:
+    """The T-LESS recipe with 10 objects, one view a drop, at half the size if not the full one."""
     camera = tless_recipe(arguments).camera
-    smaller = {"width": camera.width // SHRINK, "height": camera.height // SHRINK} | {
-        name: getattr(camera, name) / SHRINK for name in ("fx", "fy", "cx", "cy")
+    shrink = 1 if full else 2
+    smaller = {"width": camera.width // shrink, "height": camera.height // shrink} | {
+        name: getattr(camera, name) / shrink for name in ("fx", "fy", "cx", "cy")
     }
     overrides = [f"camera.{name}={value}" for name, value in smaller.items()]
     return tless_recipe(arguments, *overrides, "camera.views_per_drop=1")
 
 
 def converged(
-    session: BlenderSession, render: Callable[[], NDArray[np.float32]], recipe: Recipe, drop: int, samples: int
+    renderer: DropRenderer,
+    spec: SceneSpec,
+    settled: Sequence[Pose],
+    name: str,
+    half: int,
+    arguments: argparse.Namespace,
 ) -> NDArray[np.float32]:
-    """The scene without noise, rendered once and kept."""
-    name = f"converged_{Path(recipe.source.models).name}_{drop}_{samples}.npy"
-    path = RESULTS / name
+    """The scene with little noise, rendered once and kept; each half with noise of its own."""
+    size = f"{renderer.session.intrinsics.width}x{renderer.session.intrinsics.height}"
+    path = RESULTS / f"converged_{name}_{size}_{arguments.samples}_{'ab'[half]}.npy"
     if not path.exists():
-        session.configure(RenderSettings(samples=samples, denoiser="none"))
+        renderer.session.configure(RenderSettings(samples=arguments.samples, denoiser="none"))
         RESULTS.mkdir(exist_ok=True)
-        np.save(path, render())
+        other = dataclasses.replace(spec, drop=spec.drop + _OTHER_NOISE * (1 + half))
+        with renderer.session.scene(other, settled) as scene:
+            np.save(path, scene.render(0))
     image: NDArray[np.float32] = np.load(path)
     return image
 
 
-def psnr(image: NDArray[np.uint8], reference: NDArray[np.uint8]) -> float:
-    """Peak signal to noise ratio of two 8-bit images, dB."""
-    return float(cv2.PSNR(image, reference))
+def psnr(image: Image, halves: Sequence[Image]) -> float:
+    """Peak signal to noise ratio of an 8-bit image, dB, against what two noisy ones show."""
+    errors = [image.astype(np.float64) - half for half in halves]
+    return float(10 * np.log10(255**2 / (errors[0] * errors[1]).mean()))
 
 
-def ssim(image: NDArray[np.uint8], reference: NDArray[np.uint8]) -> float:
-    """Mean structural similarity over pixels and channels: Wang et al. 2004, Gaussian window of sigma 1.5."""
-    x, y = image.astype(np.float64), reference.astype(np.float64)
+def ssim(image: Image, halves: Sequence[Image]) -> float:
+    """Mean structural similarity over pixels and channels: Wang et al. 2004, Gaussian window of sigma 1.5.
+
+    The variance of the truth is the covariance of two noisy images of it.
+    """
+    x, a, b = (values.astype(np.float64) for values in (image, *halves))
+    y = (a + b) / 2
 
     def blur(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(cv2.GaussianBlur(values, (11, 11), 1.5))
 
     mean_x, mean_y = blur(x), blur(y)
-    var_x, var_y = blur(x * x) - mean_x**2, blur(y * y) - mean_y**2
+    var_x, var_y = blur(x * x) - mean_x**2, blur(a * b) - blur(a) * blur(b)
     covariance = blur(x * y) - mean_x * mean_y
     c1, c2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
     similarity = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
     similarity /= (mean_x**2 + mean_y**2 + c1) * (var_x + var_y + c2)
     return float(similarity.mean())
+
+
+def write(file: Path, image: Image) -> None:
+    """As PNG."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(encode_png(image))
 
 
 if __name__ == "__main__":
