@@ -315,15 +315,22 @@ def _apply(tree: dict[str, Any], override: str) -> None:
 
 def _explain(error: ValidationError, kind: type[Settings]) -> str:
     """The first fault in one line: key, value, what would be right."""
-    fault = error.errors(include_url=False)[0]
-    key = ".".join(str(part) for part in fault["loc"])
+    faults = error.errors(include_url=False)
+    fault = faults[0]
+    place = fault["loc"]
+    key = ".".join(str(part) for part in place)
     if fault["type"] == "extra_forbidden":
         known = [setting.key for setting in settings(kind)]
         groups = sorted({k[:end] for k in known for end, character in enumerate(k) if character == "."})
         return f"unknown setting {shown(key)[1:-1]}{_nearest(key, known + groups)}"
     value = fault["input"]
+    if fault["type"] == "missing" and isinstance(place[-1], int):
+        missing = sum(other["type"] == "missing" and other["loc"][:-1] == place[:-1] for other in faults)
+        return f"{key.rpartition('.')[0]} = {shown(value)}: expected {len(value) + missing} values, not {len(value)}"
+    if fault["type"] == "too_long":
+        return f"{key} = {shown(value)}: expected {fault['ctx']['max_length']} values, not {len(value)}"
     detail = _EXPECTED.get(fault["type"]) or fault["msg"][0].lower() + fault["msg"][1:]
-    more = len(error.errors()) - 1
+    more = len(faults) - 1
     suffix = f" (and {more} more)" if more else ""
     return f"{key} = {shown(value)}: {detail}{suffix}"
 

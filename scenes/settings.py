@@ -148,7 +148,7 @@ class ContainerSettings(Settings):
     @model_validator(mode="before")
     @classmethod
     def _by_name(cls, given: Any) -> Any:
-        if not isinstance(given, str):
+        if not isinstance(given, str | bool):
             return given
         if given not in CONTAINERS:
             names = ", ".join(CONTAINERS)
@@ -161,7 +161,7 @@ class ContainerSettings(Settings):
             raise PydanticCustomError(
                 "shares",
                 "the shares of box and tray add up to {total}; at most 1",
-                {"total": self.box.share + self.tray.share},
+                {"total": f"{self.box.share + self.tray.share:g}"},
             )
         return self
 
@@ -259,7 +259,7 @@ class RoomSettings(Settings):
 
 
 def _room_by_name(given: Any) -> Any:
-    if not isinstance(given, str):
+    if not isinstance(given, str | bool):
         return given
     if given not in ("none", "ranges"):
         raise PydanticCustomError("room", "unknown room; give none, ranges, or a mapping of its settings")
@@ -363,11 +363,11 @@ class RenderSettings(Settings):
     @model_validator(mode="after")
     def _refine_what_can_be(self) -> Self:
         if self.detail_samples and self.denoiser != "guided":
-            raise ValueError(
-                f"detail_samples = {self.detail_samples} needs the guided denoiser, not {self.denoiser}; give 0"
-            )
+            text = "detail_samples = {many} needs the guided denoiser, not {denoiser}; give 0"
+            raise PydanticCustomError("detail", text, {"many": self.detail_samples, "denoiser": self.denoiser})
         if 0 < self.detail_samples <= self.samples:
-            raise ValueError(f"detail_samples = {self.detail_samples} must be more than samples = {self.samples}, or 0")
+            text = "detail_samples = {many} must be more than samples = {few}, or 0"
+            raise PydanticCustomError("detail", text, {"many": self.detail_samples, "few": self.samples})
         return self
 
 
@@ -441,7 +441,7 @@ class SensorSettings(Settings):
 
 
 def _sensor_by_name(given: Any) -> Any:
-    if not isinstance(given, str):
+    if not isinstance(given, str | bool):
         return given
     if given not in ("none", *SENSORS):
         raise PydanticCustomError("sensor", "unknown sensor; give {names}", {"names": ", ".join(("none", *SENSORS))})
@@ -515,7 +515,7 @@ class DepthSensorSettings(Settings):
 
 
 def _depth_sensor_by_name(given: Any) -> Any:
-    if not isinstance(given, str):
+    if not isinstance(given, str | bool):
         return given
     if given not in ("none", *DEPTH_SENSORS):
         names = ", ".join(("none", *DEPTH_SENSORS))
