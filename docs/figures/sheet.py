@@ -4,6 +4,8 @@
         --images 24 --set camera.views_per_drop=1 --set render.quality=draft --set 'outputs=[rgb]'
     python -m docs.figures.sheet out/tless_bin docs/images/tless_bin.jpg
 
+That of tless_camera was made with ``--seed 5``, those of recipes without shoulder and seamless photographs with
+``--set render.shoulder=0.4 --set table.photos=seamless``.
 The photographs are CC0 ones of ambientCG and Poly Haven; the models are those of T-LESS (Hodan et al., WACV 2017).
 """
 
