@@ -37,6 +37,7 @@ _BAND = 64
 _SAME_COS = 0.9
 """Two neighbours with normals as near as this have no edge between them: it would be shaded as a curve."""
 _HORIZON = np.float32(1e-6)
+"""Below it, the third coordinate of ``_homography`` belongs to no point that is seen."""
 _MM = 1000.0
 
 Image = NDArray[np.float32]
