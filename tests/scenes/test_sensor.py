@@ -383,7 +383,7 @@ def test_a_preset_sets_what_is_not_given_and_is_written_out() -> None:
         ("sensor.photons=[0, 400]", r"0.* is outside 10\.\."),
         ("sensor.read_noise=0.1", r"expected a list"),
         ("sensor=[1, 2]", r"expected a mapping"),
-        ("sensor=true", r"expected a mapping"),
+        ("sensor=true", "unknown sensor; give none, ranges, primesense"),
     ],
 )
 def test_wrong_settings_are_told_in_one_line(override: str, message: str) -> None:
