@@ -123,14 +123,9 @@ def _extent(opened: Mask, pixels: int) -> slice:
 def _sheet(opened: Mask, pinhole: Intrinsics) -> NDArray[np.float64]:
     """(N, 4, 3) corners of squares in Blender's camera frame, metres, that cover all but the opened cells."""
     top, left, size = _squares(~opened)
-    above, below = (
-        _any_open(opened, top - 1, left - 1, 1, size + 2),
-        _any_open(opened, top + size, left - 1, 1, size + 2),
-    )
-    before, after = (
-        _any_open(opened, top - 1, left - 1, size + 2, 1),
-        _any_open(opened, top - 1, left + size, size + 2, 1),
-    )
+    sums = np.asarray(cv2.integral(opened.astype(np.uint8)), dtype=np.int32)
+    above, below = (_any_open(sums, row, left - 1, 1, size + 2) for row in (top - 1, top + size))
+    before, after = (_any_open(sums, top - 1, column, size + 2, 1) for column in (left - 1, left + size))
     # The middle of the first pixel is at 0; an opened cell's pixels are seen from a little beyond its border.
     v0, v1 = top * CELL_PX - 0.5 + _REACH_PX * above, (top + size) * CELL_PX - 0.5 - _REACH_PX * below
     u0, u1 = left * CELL_PX - 0.5 + _REACH_PX * before, (left + size) * CELL_PX - 0.5 - _REACH_PX * after
@@ -158,14 +153,13 @@ def _squares(closed: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[
 
 
 def _any_open(
-    opened: Mask,
+    sums: NDArray[np.int32],
     top: NDArray[np.intp],
     left: NDArray[np.intp],
     height: NDArray[np.intp] | int,
     width: NDArray[np.intp] | int,
 ) -> Mask:
-    """Whether any cell of each rectangle is open; those beyond the image are not."""
-    sums = np.pad(opened.astype(np.int64).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-    r0, r1 = (np.clip(row, 0, opened.shape[0]) for row in (top, top + height))
-    c0, c1 = (np.clip(column, 0, opened.shape[1]) for column in (left, left + width))
+    """Whether any cell of each rectangle is open, by the sums of the cells above and left; none is beyond the image."""
+    r0, r1 = (np.clip(row, 0, sums.shape[0] - 1) for row in (top, top + height))
+    c0, c1 = (np.clip(column, 0, sums.shape[1] - 1) for column in (left, left + width))
     return np.asarray(sums[r1, c1] - sums[r0, c1] - sums[r1, c0] + sums[r0, c0] > 0)

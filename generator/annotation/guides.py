@@ -9,6 +9,7 @@ share, in a copy with texels that are not much smaller than the points are apart
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from synthetless.extras import cv2
 from synthetless.scenes.denoise import Guides
 from synthetless.scenes.materials import TableTexture, table_uv
 from synthetless.scenes.spec import Intrinsics, Vector
-from synthetless.scenes.srgb import linear_from_srgb
+from synthetless.scenes.srgb import linear_of_levels
 
 _RADIUS_PX = 1.5
 """Of Cycles' pixel filter, Blackman-Harris: half of what its width of 1.5 is in its own units."""
@@ -41,6 +42,7 @@ _HORIZON = np.float32(1e-6)
 _MM = 1000.0
 
 Image = NDArray[np.float32]
+Texels = NDArray[np.uint8] | Image
 
 
 def make_guides(
@@ -104,7 +106,9 @@ def _points_px() -> NDArray[np.float64]:
 def table_albedo(camera: Intrinsics, plane: Plane, texture: TableTexture, wanted: NDArray[np.bool_]) -> Image:
     """(H, W, 3) linear albedo of the table, averaged over each pixel that is wanted; 0 elsewhere."""
     to_texels = _homography(camera, plane, texture)
-    levels = _pyramid(texture.pixels)
+    texels_per_pixel = abs(np.linalg.det(to_texels))  # where the third coordinate is 1
+    linear = linear_of_levels()
+    levels = _pyramid(texture.pixels, linear)
     result = np.zeros((*wanted.shape, 3), dtype=np.float32)
     u = _grid(0, wanted.shape[1])
     for top in range(0, wanted.shape[0], _BAND):
@@ -116,11 +120,13 @@ def table_albedo(camera: Intrinsics, plane: Plane, texture: TableTexture, wanted
         np.maximum(scale, _HORIZON, out=scale)
         x, y = x / scale, y / scale
         at_pixels = scale[_GRID:-_GRID:_GRID, _GRID:-_GRID:_GRID]
-        side = np.sqrt(abs(np.linalg.det(to_texels)) / at_pixels**3)  # in texels: of the square of the same area
+        side = np.sqrt(texels_per_pixel / at_pixels**3)  # in texels: of the square of the same area
         level = np.minimum(np.rint(np.log2(np.maximum(_TEXEL_SHARE * side, 1.0))), len(levels) - 1)
         for number in np.unique(level[band]):
-            seen = _averaged(_looked_up(levels[int(number)], x, y, texture))
-            np.copyto(result[top : top + _BAND], seen, where=(band & (level == number))[..., None])
+            seen = _looked_up(levels[int(number)], x, y, texture)
+            # Like Cycles, which interpolates what an image file says, and makes light of it then.
+            light = np.asarray(cv2.LUT(seen, linear) if seen.dtype == np.uint8 else seen, dtype=np.float32)
+            np.copyto(result[top : top + _BAND], _averaged(light), where=(band & (level == number))[..., None])
     return result
 
 
@@ -159,10 +165,10 @@ def _homography(camera: Intrinsics, plane: Plane, texture: TableTexture) -> NDAr
     return homography
 
 
-def _pyramid(pixels: NDArray[np.uint8]) -> list[NDArray[np.uint8] | Image]:
-    """The texture, and copies in linear light of half the size of the one before."""
-    levels: list[NDArray[np.uint8] | Image] = [pixels]
-    smaller = np.asarray(cv2.LUT(pixels, _linear()), dtype=np.float32)
+def _pyramid(pixels: NDArray[np.uint8], linear: NDArray[np.float32]) -> list[Texels]:
+    """The texture as it is stored, and copies in linear light of half the size of the one before."""
+    levels: list[Texels] = [pixels]
+    smaller = np.asarray(cv2.LUT(pixels, linear), dtype=np.float32)
     while min(smaller.shape[:2]) > 1:
         height, width = smaller.shape[:2]
         size = max(1, width // 2), max(1, height // 2)
@@ -171,14 +177,7 @@ def _pyramid(pixels: NDArray[np.uint8]) -> list[NDArray[np.uint8] | Image]:
     return levels
 
 
-def _linear() -> NDArray[np.float32]:
-    """(256,) the linear light that sRGB's values stand for."""
-    return np.array([linear_from_srgb(value / 255) for value in range(256)], dtype=np.float32)
-
-
-def _looked_up(
-    level: NDArray[np.uint8] | Image, x: NDArray[np.float32], y: NDArray[np.float32], texture: TableTexture
-) -> Image:
+def _looked_up(level: Texels, x: NDArray[np.float32], y: NDArray[np.float32], texture: TableTexture) -> Texels:
     """(H, W, 3) of a level of the pyramid, interpolated at texels (H, W) of the full texture."""
     repeated = texture.seamless
 
@@ -190,6 +189,5 @@ def _looked_up(
         return (place if repeated else np.minimum(place, period - place)) - np.float32(0.5)
 
     border = cv2.BORDER_WRAP if repeated else cv2.BORDER_REPLICATE
-    found = cv2.remap(level, folded(x, 1), folded(y, 0), cv2.INTER_LINEAR, borderMode=border)
-    # Like Cycles, which interpolates what an image file says, and makes light of it then.
-    return np.asarray(cv2.LUT(found, _linear()) if found.dtype == np.uint8 else found, dtype=np.float32)
+    found: NDArray[Any] = cv2.remap(level, folded(x, 1), folded(y, 0), cv2.INTER_LINEAR, borderMode=border)
+    return found
