@@ -5,7 +5,7 @@ A range is written ``[low, high]``; values are drawn uniformly between the two u
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -57,6 +57,20 @@ class Bounds:
 
 def _plain(number: float) -> str:
     return str(int(number)) if number == int(number) else f"{number:g}"
+
+
+def _is_name(given: Any, kind: str, names: Collection[str], also: str = "") -> bool:
+    """Whether a group of settings is given by name; yes and no, which YAML makes true and false, are no names.
+
+    Raises:
+        PydanticCustomError: it is none of these names.
+    """
+    if not isinstance(given, str | bool):
+        return False
+    if given not in names:
+        text = "unknown {kind}; give {names}{also}"
+        raise PydanticCustomError("name", text, {"kind": kind, "names": ", ".join(names), "also": also})
+    return True
 
 
 class Settings(BaseModel):
@@ -148,12 +162,7 @@ class ContainerSettings(Settings):
     @model_validator(mode="before")
     @classmethod
     def _by_name(cls, given: Any) -> Any:
-        if not isinstance(given, str | bool):
-            return given
-        if given not in CONTAINERS:
-            names = ", ".join(CONTAINERS)
-            raise PydanticCustomError("container", "unknown container; give {names}", {"names": names})
-        return CONTAINERS[given]
+        return CONTAINERS[given] if _is_name(given, "container", CONTAINERS) else given
 
     @model_validator(mode="after")
     def _are_shares(self) -> Self:
@@ -259,10 +268,8 @@ class RoomSettings(Settings):
 
 
 def _room_by_name(given: Any) -> Any:
-    if not isinstance(given, str | bool):
+    if not _is_name(given, "room", ("none", "ranges"), ", or a mapping of its settings"):
         return given
-    if given not in ("none", "ranges"):
-        raise PydanticCustomError("room", "unknown room; give none, ranges, or a mapping of its settings")
     return None if given == "none" else {}
 
 
@@ -441,10 +448,8 @@ class SensorSettings(Settings):
 
 
 def _sensor_by_name(given: Any) -> Any:
-    if not isinstance(given, str | bool):
+    if not _is_name(given, "sensor", ("none", *SENSORS)):
         return given
-    if given not in ("none", *SENSORS):
-        raise PydanticCustomError("sensor", "unknown sensor; give {names}", {"names": ", ".join(("none", *SENSORS))})
     return None if given == "none" else {"preset": given}
 
 
@@ -515,11 +520,8 @@ class DepthSensorSettings(Settings):
 
 
 def _depth_sensor_by_name(given: Any) -> Any:
-    if not isinstance(given, str | bool):
+    if not _is_name(given, "depth sensor", ("none", *DEPTH_SENSORS)):
         return given
-    if given not in ("none", *DEPTH_SENSORS):
-        names = ", ".join(("none", *DEPTH_SENSORS))
-        raise PydanticCustomError("depth_sensor", "unknown depth sensor; give {names}", {"names": names})
     return None if given == "none" else {"preset": given}
 
 
