@@ -26,6 +26,7 @@ from synthetless.config import Recipe
 from synthetless.generation.drop import DropRenderer
 from synthetless.generation.sources import load_sources
 from synthetless.io.color import exposure_gain, tonemap
+from synthetless.io.files import atomic_write
 from synthetless.io.images import decode_rgb, encode_jpeg, encode_png
 from synthetless.scenes.settings import RenderSettings
 from synthetless.scenes.spec import Pose, SceneSpec
@@ -64,7 +65,7 @@ def main() -> None:
             for candidate, row in compare(renderer, recipe, drop, name, arguments).items():
                 rows.setdefault(Path(models).name, {}).setdefault(candidate, []).append(row)
                 print(name, candidate, *(f"{value:.4f}" for value in row), flush=True)
-    rows["all"] = {name: [row for found in list(rows.values()) for row in found[name]] for name in arguments.candidates}
+    rows["all"] = {name: [row for found in rows.values() for row in found[name]] for name in arguments.candidates}
     columns = ("psnr_db", "ssim", "cpu_s", "kilobytes")
     table = {
         of: {
@@ -98,9 +99,11 @@ def compare(
             image = decode_rgb(content)
             found[candidate] = psnr(image, halves), ssim(image, halves), spent, len(content) / 1000
             if arguments.pictures:
-                write(arguments.pictures / f"{name}_{candidate.replace(' ', '_').replace(',', '')}.png", image)
+                file = arguments.pictures / f"{name}_{candidate.replace(' ', '_').replace(',', '')}.png"
+                atomic_write(file, encode_png(image))
     if arguments.pictures:
-        write(arguments.pictures / f"{name}_converged.png", tonemap((truth[0] + truth[1]) / 2, gain))
+        mean = tonemap((truth[0] + truth[1]) / 2, gain)
+        atomic_write(arguments.pictures / f"{name}_converged.png", encode_png(mean))
     return found
 
 
@@ -160,12 +163,6 @@ def ssim(image: Image, halves: Sequence[Image]) -> float:
     similarity = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
     similarity /= (mean_x**2 + mean_y**2 + c1) * (var_x + var_y + c2)
     return float(similarity.mean())
-
-
-def write(file: Path, image: Image) -> None:
-    """As PNG."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_bytes(encode_png(image))
 
 
 if __name__ == "__main__":
