@@ -130,7 +130,7 @@ class Denoiser:
 def _load() -> Any:
     """The library, with the types of what is called of it."""
     folder = Path(blender.module().utils.resource_path("LOCAL")).parent
-    found = sorted(path for pattern in _LIBRARIES for path in folder.rglob(pattern))
+    found = sorted(path for pattern in _LIBRARIES for depth in ("", "*/") for path in folder.glob(depth + pattern))
     if not found:
         raise blender.BlenderError(
             f"{folder}: has no Open Image Denoise; use Blender's own denoiser: --set render.denoiser=fast"

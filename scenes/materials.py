@@ -145,6 +145,8 @@ def _surface(nodes: Any, links: Any, roughness: float, specular: float, metallic
         shader.inputs["Roughness"].default_value = roughness
         shader.inputs["Specular IOR Level"].default_value = specular
         shader.inputs["Metallic"].default_value = metallic
+        # Nothing here is brushed, so no tangent counts; one that is not given is computed wherever a path bounces.
+        links.new(nodes.new("ShaderNodeNewGeometry").outputs["True Normal"], shader.inputs["Tangent"])
     output = nodes.new("ShaderNodeOutputMaterial")
     links.new(shader.outputs[0], output.inputs["Surface"])
     return shader
