@@ -61,7 +61,10 @@ _NAMES: Mapping[type[Settings], tuple[str, ...]] = {
 Output = Literal["rgb", "depth", "depth_sensed", "masks", "normals", "object_coordinates", "exr"]
 
 
-_EXPECTED = {"tuple_type": "expected a list, such as [min, max]", "model_type": "expected a mapping of settings"}
+_EXPECTED = {
+    "tuple_type": "expected a list, such as [min, max] or [rgb, depth]",
+    "model_type": "expected a mapping of settings",
+}
 """Faults whose wording by pydantic would speak of Python instead of the recipe."""
 
 
