@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from synthetless.extras import cv2
 from synthetless.scenes import blender
 
 Image = NDArray[np.float32]
@@ -27,8 +28,12 @@ _LIBRARIES = (
 )
 _CPU, _FLOAT3 = 1, 3  # OIDN_DEVICE_TYPE_CPU, OIDN_FORMAT_FLOAT3
 _BALANCED = 5  # OIDN_QUALITY_BALANCED: in the time that the larger network takes more, paths gain more than it does
-_DARK = np.float32(1e-3)
-"""Added to an albedo that is divided by."""
+_AROUND_PX = 25
+"""Side of the square around a pixel whose light stands for its own where the texture is black there."""
+_BLACK = np.float32(1e-3)
+"""Albedo at which the one counts as much as the other."""
+_TINY = np.float32(1e-5)
+"""Added to means of albedos that are divided by."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +44,7 @@ class Guides:
         albedo: (H, W, 3) linear; 0 where there is no surface.
         normals: (H, W, 3) unit normals, averaged; 0 where there is no surface.
         known: (H, W) where the albedo is that of all that is seen.
-        textured: (H, W) where it is that of a texture alone, of no edge: the light may be taken for even there.
+        textured: (H, W) where it is that of a matte texture alone, of no edge: the light may be taken for even there.
     """
 
     albedo: Image
@@ -51,18 +56,40 @@ class Guides:
         """With the albedo as it was sampled, (H, W, 3), where it is not known."""
         return replace(self, albedo=np.where(self.known[..., None], self.albedo, sampled))
 
-    def without_texture_noise(self, linear: Image, sampled: Image) -> Image:
-        """A noisy (H, W, 3) image with a pixel's texture as it is, not as the few paths met it.
+    def without_texture(self, linear: Image, sampled: Image) -> tuple[Image, Image, Image]:
+        """A noisy image as if what is textured were of one colour, so that a denoiser has no texture to keep.
 
-        Each path brings albedo times light; where the light is even, the mean of the products is the mean of the
-        albedos times the light, so the ratio of the true mean to the sampled one takes the texture's noise away.
+        A matte surface sends albedo times irradiance, and it is the irradiance that is noisy, and smooth (C. Schied
+        et al., Spatiotemporal variance-guided filtering, HPG 2017). Where it is black, its surroundings tell that.
 
         Args:
-            linear: the image.
+            linear: (H, W, 3) the image.
             sampled: (H, W, 3) the albedo that its paths met.
+
+        Returns:
+            The image, its albedo, and what brings the texture back when the image is multiplied by it; each (H, W, 3).
         """
-        ratio = (self.albedo + _DARK) / (sampled + _DARK)
-        return np.where(self.textured[..., None], linear * ratio, linear)
+        albedo = self.completed(sampled).albedo
+        if not self.textured.any():
+            return linear, albedo, np.ones_like(linear)
+        textured = np.repeat(self.textured[..., None], 3, axis=2)
+        plain = self._mean(albedo) + _TINY
+        everywhere = self._mean(linear) / (self._mean(sampled) + _TINY)
+        around = (_around(linear * textured) + _TINY * everywhere) / (_around(sampled * textured) + _TINY)
+        irradiance = (linear + _BLACK * around) / (sampled + _BLACK)
+        return (
+            np.where(textured, irradiance * plain, linear),
+            np.where(textured, plain, albedo),
+            np.where(textured, albedo / plain, np.float32(1)),
+        )
+
+    def _mean(self, image: Image) -> Image:
+        """(3,) of what is textured."""
+        return np.array(cv2.mean(image, self.textured.astype(np.uint8))[:3], dtype=np.float32)
+
+
+def _around(image: Image) -> Image:
+    return np.asarray(cv2.blur(image, (_AROUND_PX, _AROUND_PX)), dtype=np.float32)
 
 
 class Denoiser:
@@ -102,12 +129,8 @@ class Denoiser:
                     f"{name} of shape {image.shape} and type {image.dtype}; float32 like the image is needed"
                 )
         call, result = self._library, np.empty_like(linear, order="C")
-        images = {
-            "color": guides.without_texture_noise(linear, sampled),
-            "albedo": guides.completed(sampled).albedo,
-            "normal": guides.normals,
-            "output": result,
-        }
+        color, albedo, texture = guides.without_texture(linear, sampled)
+        images = {"color": color, "albedo": albedo, "normal": guides.normals, "output": result}
         images = {name: np.ascontiguousarray(image) for name, image in images.items()}
         for name, image in images.items():
             call.oidnSetSharedFilterImage(
@@ -119,7 +142,7 @@ class Denoiser:
         call.oidnCommitFilter(self._filter)
         call.oidnExecuteFilter(self._filter)
         self._refuse_error()
-        return result
+        return result * texture
 
     def _refuse_error(self) -> None:
         message = ctypes.c_char_p()

@@ -20,8 +20,10 @@ from synthetless.scenes.srgb import LUMINANCE_WEIGHTS
 
 CELL_PX = 4
 """Side of the squares of pixels that are refined or not: smaller ones cost more to cover than they save."""
-SHARE = 0.2
-"""Of the cells of an image that are refined."""
+_AROUND_PX = 3
+"""Side of the squares of pixels that noise is measured in."""
+_SMOOTH = 0.3
+"""Weight of noise where the denoiser has light alone to smooth, and no texture or edge to keep."""
 _REACH_PX = 1.0
 """How far beyond its pixel Cycles' pixel filter looks: its radius is 1.5."""
 _DISTANCE_M = 0.1
@@ -35,29 +37,36 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 
-def noisy_cells(light: Image, albedo: Image) -> Mask:
-    """The cells (ceil(H / CELL_PX), ceil(W / CELL_PX)) of an image that look noisiest: SHARE of them.
+def noisy_cells(light: Image, albedo: Image, smooth: Mask, share: float) -> Mask:
+    """The cells (ceil(H / CELL_PX), ceil(W / CELL_PX)) of an image that look noisiest: so large a share.
 
     Noise is told from texture by the albedo; an edge in the light counts as noise, since pixels of it are noisy.
 
     Args:
         light: (H, W, 3) of few paths per pixel, linear.
         albedo: (H, W, 3) of what is seen there, with as little noise as can be.
+        smooth: (H, W) where noise is removed best.
+        share: of the cells, more than 0.
     """
     luminance: NDArray[np.float32] = light @ LUMINANCE_WEIGHTS
     irradiance: NDArray[np.float32] = luminance / (albedo @ LUMINANCE_WEIGHTS + np.float32(_DARK))
-    mean = cv2.blur(irradiance, (3, 3))
-    variance = np.maximum(cv2.blur(irradiance * irradiance, (3, 3)) - mean * mean, 0)
+    mean, bright = _blurred(irradiance), _blurred(luminance)
+    variance = np.maximum(_blurred(irradiance * irradiance) - mean * mean, 0)
     # As displayed: a relative change counts for more where an image is bright.
-    seen = variance / (mean * mean + np.float32(1e-6)) * cv2.blur(luminance, (3, 3)) ** np.float32(2 / _GAMMA)
+    seen = variance / (mean * mean + np.float32(1e-6)) * bright ** np.float32(2 / _GAMMA)
+    seen[smooth] *= np.float32(_SMOOTH)
     height, width = seen.shape
     rows, columns = -(-height // CELL_PX), -(-width // CELL_PX)
     padded = np.pad(seen, ((0, rows * CELL_PX - height), (0, columns * CELL_PX - width)), mode="edge")
     cells = padded.reshape(rows, CELL_PX, columns, CELL_PX).mean(axis=(1, 3))
-    chosen = max(1, round(SHARE * cells.size))
+    chosen = max(1, round(share * cells.size))
     noisy = np.zeros(cells.size, dtype=bool)
     noisy[np.argsort(cells, axis=None, kind="stable")[-chosen:]] = True
     return noisy.reshape(cells.shape)
+
+
+def _blurred(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(cv2.blur(values, (_AROUND_PX, _AROUND_PX)), dtype=np.float32)
 
 
 def pixels_of(cells: Mask, height: int, width: int) -> Mask:

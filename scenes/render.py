@@ -214,14 +214,16 @@ class BlenderScene:
         cycles.sample_offset, cycles.sample_subset_length = 0, few
         image = self._rendered(view, with_albedo=True)
         light, albedo = image[..., :3], image[..., 3:]
-        cells = noisy_cells(guides.without_texture_noise(light, albedo), guides.completed(albedo).albedo)
+        # What paths brought from a texture goes with the albedo that they met, not with the pixel's.
+        met = replace(guides, known=guides.known & ~guides.textured).completed(albedo).albedo
+        cells = noisy_cells(light, met, guides.textured, settings.detail_share)
         cycles.sample_offset, cycles.sample_subset_length = few, many - few
         with stencil(bpy, bpy.context.scene.camera, self.session.pinhole, cells) as window:
             more = self._rendered(view, with_albedo=True)
         _configure(bpy.context.scene, settings)
         noisy = pixels_of(cells, *image.shape[:2])[window]
-        seen = image[window]
-        seen[noisy] = (few * seen[noisy] + (many - few) * more[noisy]) / np.float32(many)
+        refined = image[window]
+        refined[noisy] = (few * refined[noisy] + (many - few) * more[noisy]) / np.float32(many)
         return image
 
     def _rendered(self, view: int, with_albedo: bool = False) -> NDArray[np.float32]:

@@ -320,8 +320,8 @@ class TableSettings(Settings):
 
 
 QUALITIES: dict[str, dict[str, Any]] = {
-    "draft": {"samples": 1, "detail_samples": 6, "denoiser": "guided"},
-    "standard": {"samples": 2, "detail_samples": 11, "denoiser": "guided"},
+    "draft": {"samples": 1, "detail_samples": 4, "denoiser": "guided"},
+    "standard": {"samples": 2, "detail_samples": 8, "denoiser": "guided"},
     "reference": {"samples": 256, "detail_samples": 0, "denoiser": "accurate"},
 }
 """What the named qualities stand for; how near each comes to a converged render is in docs/scaling.md."""
@@ -337,8 +337,10 @@ class RenderSettings(Settings):
     samples: Annotated[int, Bounds(1, 65536, "samples")] = QUALITIES["standard"]["samples"]
     """Light paths per pixel; if not given, those of the quality."""
     detail_samples: Annotated[int, Bounds(0, 65536, "samples")] = QUALITIES["standard"]["detail_samples"]
-    """Light paths per pixel in the fifth of an image that is noisiest, with the guided denoiser; 0 for no more than
-    elsewhere; if not given, those of the quality, where they are more than samples."""
+    """Light paths per pixel where an image is noisiest, with the guided denoiser; 0 for no more than elsewhere; if not
+    given, those of the quality, where they are more than samples."""
+    detail_share: Annotated[float, Bounds(0.01, 1)] = 0.2
+    """Share of the image that gets as many."""
     denoiser: Literal["none", "guided", "fast", "accurate"] = QUALITIES["standard"]["denoiser"]
     """Open Image Denoise with albedo and normal guides: none; guided, by guides without noise, from the geometry; or as
     Blender calls it, fast (guides as sampled) or accurate (guides denoised first); if not given, the quality's."""

@@ -71,7 +71,7 @@ def make_guides(
     known = told.take(owner, mode="wrap")
     on_table = (owner == len(bodies)).astype(np.float32)
     near_edge = _has_edge(owner, normals)
-    textured = (owner == len(bodies)) & ~near_edge
+    textured = (owner == len(bodies)) & ~near_edge & (texture.plane.specular == 0)
     rows, columns = pixels_where(near_edge)
     finer = caster.surfaces_between(camera, plane, bodies, np.stack([columns, rows], axis=1), _points_px())
     albedo[rows, columns] = colours.take(finer[0], axis=0, mode="wrap").mean(axis=1)

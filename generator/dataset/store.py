@@ -184,7 +184,7 @@ class DatasetStore:
         begun_with = read_recipe(root)  # with today's defaults for settings that it did not know
         header = read_json(root / DATASET_FILE)
         rendered = header["recipe"].get("render", {})
-        if rendered.get("denoiser") == "guided" and "detail_samples" not in rendered:
+        if rendered.get("denoiser") == "guided" and "detail_share" not in rendered:
             raise DatasetError(
                 f"{root / DATASET_FILE}: was begun with an earlier guided denoiser, which is gone; "
                 "use another output folder"

@@ -100,3 +100,13 @@ def test_what_has_more_than_one_colour_is_not_known() -> None:
     assert not coloured.known[owner == 0].any()
     assert coloured.known[owner == 1].mean() > 0.8  # all but the pixels along its edge
     assert make_guides(caster, CAMERA, plane, [posed], [(0.5, 0.5, 0.5)], _texture(True)).known.all()
+
+
+def test_what_shines_shows_more_than_its_texture() -> None:
+    box = trimesh.creation.box((60, 60, 60))
+    caster = RayCaster({("model", 1): (np.array(box.vertices), np.array(box.faces))})
+    plane, matte = _plane(50.0), _texture(True)
+    posed = PosedModel(1, plane.R_w2c, plane.R_w2c @ [0, 0, 30.0] + plane.t_w2c)
+    shining = dataclasses.replace(matte, plane=dataclasses.replace(matte.plane, specular=0.5))
+    assert make_guides(caster, CAMERA, plane, [posed], [None], matte).textured.mean() > 0.5
+    assert not make_guides(caster, CAMERA, plane, [posed], [None], shining).textured.any()

@@ -173,7 +173,7 @@ def test_what_an_earlier_guided_denoiser_made_is_not_continued(recipe: Recipe, b
     file = begun / DATASET_FILE
     header = json.loads(file.read_text())
     header["recipe"]["render"] |= {"samples": 7, "denoiser": "guided"}
-    del header["recipe"]["render"]["detail_samples"]
+    del header["recipe"]["render"]["detail_share"]
     file.write_text(json.dumps(header))
     before = contents(begun)
     as_before = recipe.render.model_copy(update={"samples": 7, "detail_samples": 0})

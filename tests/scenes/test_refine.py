@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synthetless.scenes import blender, camera, lights
-from synthetless.scenes.refine import CELL_PX, SHARE, _sheet, noisy_cells, pixels_of, stencil
+from synthetless.scenes.refine import CELL_PX, _sheet, noisy_cells, pixels_of, stencil
 from synthetless.scenes.render import read_exr
 from synthetless.scenes.spec import AmbientLight, Intrinsics
 
@@ -20,17 +20,25 @@ def test_noise_is_found_in_the_light_and_not_in_the_texture() -> None:
     albedo = rng.uniform(0.2, 0.8, (80, 80, 1)).astype(np.float32).repeat(3, axis=2)
     light = np.ones((80, 80, 1), dtype=np.float32)
     light[20:50, 30:60] = rng.uniform(0.5, 1.5, (30, 30, 1))
-    cells = noisy_cells(albedo * light, albedo)
-    assert cells.sum() == round(SHARE * cells.size)
+    cells = noisy_cells(albedo * light, albedo, np.zeros((80, 80), dtype=bool), 0.15)
+    assert cells.sum() == round(0.15 * cells.size)
     noisy = np.zeros((80, 80), dtype=bool)
     noisy[20:50, 30:60] = True
     assert (pixels_of(cells, 80, 80) | ~noisy).mean() > 0.98
 
 
+def test_noise_counts_for_less_where_it_is_removed_best() -> None:
+    light = np.random.default_rng(1).uniform(0.5, 1.5, (80, 80, 1)).astype(np.float32).repeat(3, axis=2)
+    smooth = np.zeros((80, 80), dtype=bool)
+    smooth[:, :40] = True
+    cells = noisy_cells(light, np.ones_like(light), smooth, 0.5)
+    assert pixels_of(cells, 80, 80)[~smooth].mean() > 0.98
+
+
 @pytest.mark.parametrize("shape", [(1, 1), (3, 5), (9, 300), (65, 66)])
 def test_images_of_any_size_have_cells(shape: tuple[int, int]) -> None:
     black = np.zeros((*shape, 3), dtype=np.float32)
-    cells = noisy_cells(black, black)
+    cells = noisy_cells(black, black, black[..., 0] > 0, 0.15)
     assert cells.any()
     assert pixels_of(cells, *shape).shape == shape
 
