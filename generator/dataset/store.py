@@ -183,12 +183,7 @@ class DatasetStore:
         """
         begun_with = read_recipe(root)  # with today's defaults for settings that it did not know
         header = read_json(root / DATASET_FILE)
-        rendered = header["recipe"].get("render", {})
-        if rendered.get("denoiser") == "guided" and "detail_share" not in rendered:
-            raise DatasetError(
-                f"{root / DATASET_FILE}: was begun with an earlier guided denoiser, which is gone; "
-                "use another output folder"
-            )
+        refuse_former_denoiser(root / DATASET_FILE, header)
         before = {**header, "recipe": dump_recipe(begun_with)}
         _refuse_other(root / DATASET_FILE, before, _header(recipe, models, scenery_digest))
         return cls(root, recipe.model_copy(update={"images": max(recipe.images, begun_with.images)}))
@@ -397,6 +392,20 @@ def _textures(models: Mapping[int, ObjectModel]) -> dict[str, dict[str, str]]:
 def versions() -> dict[str, str]:
     """What is installed here of that which pixels depend on."""
     return {name: version(name) for name in ("synthetless", "bpy")}
+
+
+def refuse_former_denoiser(path: Path, header: Mapping[str, Any]) -> None:
+    """Refuse to make images of a dataset whose ``dataset.json``, at ``path``, records a denoiser that is gone.
+
+    Raises:
+        DatasetError: it does.
+    """
+    rendered = header["recipe"].get("render", {})
+    if rendered.get("denoiser") == "guided" and "detail_share" not in rendered:
+        raise DatasetError(
+            f"{path}: was begun with an earlier guided denoiser, which is gone: none of its images can be rendered "
+            "again, or added to; use another output folder"
+        )
 
 
 def make_folder(root: Path) -> None:

@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from synthetless.annotation.scene import MM_PER_M, scene_caster, scene_guides
 from synthetless.config import BUILTIN, Recipe, models_folder
-from synthetless.dataset.layout import MODELS_FOLDER, ScenePaths
+from synthetless.dataset.layout import DATASET_FILE, MODELS_FOLDER, ScenePaths
 from synthetless.dataset.reader import read_recipe, read_specs
+from synthetless.dataset.store import refuse_former_denoiser
 from synthetless.errors import UserError
 from synthetless.io.color import picture
+from synthetless.io.files import read_json
 from synthetless.io.models import ObjectModel, load_models
 from synthetless.scenes.render import BlenderSession
 from synthetless.scenes.spec import Mesh, Role, SceneSpec
@@ -33,9 +35,10 @@ def render_again(dataset: Path, scene_id: int, im_id: int, textures: Path | None
         (H, W, 3) sRGB, equal to the stored PNG pixel by pixel.
 
     Raises:
-        UserError: there is no such image, or a file that it needs is missing.
+        UserError: there is no such image, a file that it needs is missing, or it was made with a denoiser that is gone.
     """
     recipe = read_recipe(dataset)
+    refuse_former_denoiser(dataset / DATASET_FILE, read_json(dataset / DATASET_FILE))
     paths = ScenePaths.of(dataset, scene_id, recipe.split)
     recorded = read_specs(paths)
     if im_id not in recorded:

@@ -20,6 +20,7 @@ from synthetless.generation import executors
 from synthetless.generation import generate as generation
 from synthetless.generation.executors import DropResult, DropTask
 from synthetless.generation.generate import Execution, generate, retry
+from synthetless.generation.rerender import render_again
 from synthetless.io.files import LockedError, in_turn, locked
 from synthetless.scenes.blender import BlenderError
 
@@ -177,6 +178,10 @@ def test_what_an_earlier_guided_denoiser_made_is_not_continued(recipe: Recipe, b
     file.write_text(json.dumps(header))
     before = contents(begun)
     as_before = recipe.render.model_copy(update={"samples": 7, "detail_samples": 0})
-    with pytest.raises(ValueError, match=r"begun with an earlier guided denoiser, which is gone; use another"):
+    with pytest.raises(
+        ValueError, match=r"begun with an earlier guided denoiser, which is gone: .*; use another output folder"
+    ):
         generate(recipe.model_copy(update={"render": as_before}), begun, Execution(workers=1))
+    with pytest.raises(ValueError, match=r"earlier guided denoiser, which is gone"):
+        render_again(begun, 1, 0)
     assert contents(begun) == before
